@@ -11,8 +11,7 @@ import math
 import os
 import re
 from ast import AnnAssign, ClassDef, Constant, Expr, Name, parse
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import cache, partial
 from itertools import pairwise
 from numbers import Integral
@@ -201,8 +200,13 @@ def python_function(
 
     def function(*args: _Arguments.args, **kwargs: _Arguments.kwargs) -> _Result:
         asked = options(*args, **kwargs)
-        with named_as_arguments(options):
+        try:
             return run(asked)
+        except SkylessError as error:
+            text = as_arguments(str(error), options)
+            if text == str(error):
+                raise
+            raise SkylessError(text) from None
 
     helps = (
         fill(f"{name}: {as_arguments(text, options)}", 116, initial_indent=" " * 8, subsequent_indent=" " * 12)
@@ -230,18 +234,6 @@ def as_arguments(text: str, struct: type[Options]) -> str:
     """A text with arguments instead of options."""
     names = {field.option: name for name, field in option_fields(struct).items()}
     return _OPTION.sub(lambda found: names.get(found[1], found[1].replace("-", "_")), text)
-
-
-@contextmanager
-def named_as_arguments(struct: type[Options]) -> Iterator[None]:
-    """In the block errors that name an option of a command name the argument instead."""
-    try:
-        yield
-    except SkylessError as error:
-        text = as_arguments(str(error), struct)
-        if text == str(error):
-            raise
-        raise SkylessError(text) from None
 
 
 # Which values are right

@@ -10,10 +10,11 @@ from urllib.parse import urlsplit
 
 import pytest
 
-from skyless.cli.dashboard import _address, _listening, _rules
+from skyless.cli.dashboard import DashboardOptions, _address, _rules
 from skyless.cli.main import main
+from skyless.cli.nodes.options import listen_address
 from skyless.core.errors import SkylessError
-from skyless.page.app import PORT, ListenAddress, bind
+from skyless.page.app import PORT, bind
 from skyless.run.process import reserve
 from skyless.sim.lab import lab_site
 from support.processes import free_port
@@ -24,7 +25,7 @@ pytestmark = pytest.mark.site
 @pytest.mark.parametrize(
     ("text", "host", "port"),
     [
-        (None, "127.0.0.1", None),
+        (DashboardOptions().listen, "127.0.0.1", None),
         ("127.0.0.1:9000", "127.0.0.1", 9000),
         ("[::1]:9000", "::1", 9000),
         ("::1", "::1", None),
@@ -35,13 +36,13 @@ pytestmark = pytest.mark.site
     ],
 )
 def test_where_to_listen(text, host, port):
-    assert _listening(text) == ListenAddress(host, port)
+    assert listen_address(text, PORT) == (host, port)
 
 
 @pytest.mark.parametrize("text", ["", ":8080", "127.0.0.1:x", "127.0.0.1:70000", "127.0.0.1:-1", "localhost:8080x"])
 def test_a_wrong_listening_is_refused_with_what_would_be_right(text):
     with pytest.raises(SkylessError, match="HOST:PORT"):
-        _listening(text)
+        listen_address(text, PORT)
 
 
 def test_a_taken_port_is_an_error_when_it_was_asked_for():
@@ -50,30 +51,30 @@ def test_a_taken_port_is_an_error_when_it_was_asked_for():
         other.listen()
         port = other.getsockname()[1]
         with pytest.raises(SkylessError, match=f"--listen is '127.0.0.1:{port}'; another program uses this port"):
-            bind(ListenAddress("127.0.0.1", port))
+            bind("127.0.0.1", port)
 
 
 def test_the_next_free_port_is_taken_when_none_was_asked_for():
-    with bind(ListenAddress("127.0.0.1", None)) as first, bind(ListenAddress("127.0.0.1", None)) as second:
+    with bind("127.0.0.1", None) as first, bind("127.0.0.1", None) as second:
         assert PORT <= first.getsockname()[1] < second.getsockname()[1]
 
 
 def test_a_port_that_a_demo_has_named_is_left_to_its_page():
-    with bind(ListenAddress("127.0.0.1", None)) as first:
+    with bind("127.0.0.1", None) as first:
         port = first.getsockname()[1]
         claimed = reserve("127.0.0.1", port)
     assert claimed is not None
-    with claimed, bind(ListenAddress("127.0.0.1", None)) as second:
+    with claimed, bind("127.0.0.1", None) as second:
         assert second.getsockname()[1] != port
-        with bind(ListenAddress("127.0.0.1", port)) as page:
+        with bind("127.0.0.1", port) as page:
             assert page.getsockname()[1] == port
 
 
 def test_an_address_of_another_machine_is_refused():
     with pytest.raises(SkylessError, match="cannot listen"):
-        bind(ListenAddress("192.0.2.1", 8080))
+        bind("192.0.2.1", 8080)
     with pytest.raises(SkylessError, match="cannot listen"):
-        bind(ListenAddress("no such host", 8080))
+        bind("no such host", 8080)
 
 
 def test_loopback_needs_no_token_and_all_else_gets_one():
@@ -138,6 +139,7 @@ def test_the_server_loads_nothing_heavy():
 BUSY = """
 import sys
 from skyless.cli.main import main
+from skyless.cli.nodes.options import listen_address
 from skyless.page.api import questions
 from skyless.page.tasks import TaskProcess
 

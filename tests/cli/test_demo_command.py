@@ -213,24 +213,20 @@ def test_a_demo_that_is_killed_leaves_no_program_behind(tmp_path):
     demo.end(signal.SIGKILL)
 
 
-def test_ctrl_c_while_it_starts_ends_all_and_leaves_nothing_at_a_broker_of_others(tmp_path):
+async def test_ctrl_c_while_it_starts_ends_all_and_leaves_nothing_at_a_broker_of_others(tmp_path):
     foreign = status_topic(1, "tag", "foreign")
-
-    async def start_and_end():
-        async with await start_broker(BrokerSettings(temporary=True)) as broker:
-            demo = Demo(tmp_path, "--json", "--mqtt", str(broker.address))
-            demo.wait_for(lambda: len(demo.children()) >= 2)
-            connection = await open_connection(broker.address, None, Introduction("", 10))
-            connection.publish(foreign, b"not a status", 1, retain=True)
-            await connection.leave()
-            while len(await retained(broker.address)) < 2:
-                assert demo.process.poll() is None
-            code, out = demo.end(signal.SIGINT)
-            return demo.said, code, out, await retained(broker.address)
-
-    said, code, out, left = asyncio.run(start_and_end())
+    async with await start_broker(BrokerSettings(temporary=True)) as broker:
+        demo = Demo(tmp_path, "--json", "--mqtt", str(broker.address))
+        demo.wait_for(lambda: len(demo.children()) >= 2)
+        connection = await open_connection(broker.address, None, Introduction("", 10))
+        connection.publish(foreign, b"not a status", 1, retain=True)
+        await connection.leave()
+        while len(await retained(broker.address)) < 2:
+            assert demo.process.poll() is None
+        code, out = demo.end(signal.SIGINT)
+        left = await retained(broker.address)
     assert code == 0
-    assert "Traceback" not in said
+    assert "Traceback" not in demo.said
     assert json.loads(out)["rmse_m"] is None
     assert left == {foreign}
 

@@ -94,28 +94,22 @@ def test_verification_tells_its_points(lab, capsys):
         assert point["ratio"] == pytest.approx(1.0, abs=0.03 + 4 * point["ratio_error"])
 
 
-def test_one_anchor(lab, complaint):
-    first = lab.read_text().split("[[anchors]]")[:2]
-    lab.write_text("[[anchors]]".join(first))
-    assert "lab.toml: anchors is" in (line := complaint("plan", lab))
-    assert "at least 3" in line
-
-
-def test_all_anchors_in_one_point(lab, complaint):
-    lab.write_text(re.sub(r"(x|y)_m = \d+\.\d+\n", r"\1_m = 1.0\n", lab.read_text()))
-    assert "anchors[1] (anchor 2)" in (line := complaint("plan", lab))
-    assert "same point" in line
-
-
-def test_not_a_number(lab, complaint):
-    lab.write_text(lab.read_text().replace("x_m = 6.0", "x_m = nan", 1))
-    assert "anchors[1].x_m (anchor 2) is nan; it should be a number of metres" in complaint("plan", lab)
-
-
-def test_anchors_outside_the_plan(lab, complaint):
-    lab.write_text(lab.read_text().replace("width_m = 6.0", "width_m = 3.0"))
-    assert "(anchor 2)" in (line := complaint("plan", lab))
-    assert "on the floor, which reaches from (0, 0) to (3, 4) m" in line
+@pytest.mark.parametrize(
+    ("changed", "said"),
+    [
+        (lambda text: "[[anchors]]".join(text.split("[[anchors]]")[:2]), ["lab.toml: anchors is", "at least 3"]),
+        (lambda text: re.sub(r"(x|y)_m = \d+\.\d+\n", r"\1_m = 1.0\n", text), ["anchors[1] (anchor 2)", "same point"]),
+        (lambda text: text.replace("x_m = 6.0", "x_m = nan", 1),
+         ["anchors[1].x_m (anchor 2) is nan; it should be a number of metres"]),
+        (lambda text: text.replace("width_m = 6.0", "width_m = 3.0"),
+         ["(anchor 2)", "on the floor, which reaches from (0, 0) to (3, 4) m"]),
+    ],
+)  # fmt: skip
+def test_a_wrong_site_is_reported(lab, complaint, changed, said):
+    """One anchor, all in one point, not a number, outside the plan."""
+    lab.write_text(changed(lab.read_text()))
+    line = complaint("plan", lab)
+    assert [part for part in said if part not in line] == []
 
 
 @pytest.mark.parametrize("keep", [0, 10, 200])

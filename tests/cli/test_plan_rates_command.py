@@ -56,18 +56,6 @@ def test_a_new_grid(tmp_path, capsys):
     assert (report["mode"], report["master"], len(report["anchors"])) == (site.schedule.mode, None, 48)
 
 
-@pytest.mark.parametrize(
-    ("options", "said"),
-    [
-        (["--spacing", "5"], "a grid needs"),
-        ([*GRID, "--anchor-count", "5"], "a grid needs"),
-        (["--width", "10000", "--depth", "10000", "--spacing", "15"], "444889 anchors are too many"),
-    ],
-)
-def test_grids_that_cannot_be(tmp_path, complaint, options, said):
-    assert said in complaint("site", "new", tmp_path / "x.toml", *options)
-
-
 def test_a_table_with_few_anchors_shows_those_without_a_position(tmp_path, capsys):
     path = tmp_path / "few.toml"
     path.write_text(

@@ -382,19 +382,6 @@ SIMULATE = [
 ]
 
 
-def refused(right, call, arguments):
-    """A wrong call raises one line of error that names Python's arguments, not the options of the command."""
-    with pytest.raises(skyless.SkylessError, match=right) as found:
-        call(**arguments)
-    assert "\n" not in str(found.value)
-    assert "--" not in str(found.value)
-
-
-@pytest.mark.parametrize(("arguments", "right"), SIMULATE, ids=[str(sorted(given)) for given, _ in SIMULATE])
-def test_mistakes_of_a_simulation_are_named(arguments, right):
-    refused(right, skyless.simulate, arguments)
-
-
 def test_a_request_that_cannot_be_simulated_is_refused_as_well():
     with pytest.raises(skyless.SkylessError, match=r"positions_m\[0\] is \(3,\)"):
         skyless.fleet_of(skyless.Request(paper_lab_site(accuracy=AccuracySite()), positions_m=((3,),)))
@@ -423,11 +410,6 @@ REPLAY = [
 ]
 
 
-@pytest.mark.parametrize(("arguments", "right"), REPLAY, ids=[str(sorted(given)) for given, _ in REPLAY])
-def test_mistakes_of_a_replay_are_named(folder, arguments, right):
-    refused(right, skyless.replay, {"file": folder / "tdoa-table", "anchors": synthetic.ANCHORS_M} | arguments)
-
-
 PLAN = [
     ({"site": "no.toml"}, "site is 'no.toml'; it should be a file"),
     ({"noise_ps": float("nan")}, "noise_ps is nan"),
@@ -441,21 +423,11 @@ PLAN = [
     ({"optimise": 2}, "optimise is 2; it should be a whole number, at least 3, at most 60"),
     ({"step_m": 1e-9}, "no map"),
     ({"exponent": 2.0}, "exponent is 2; it should be left out: it is for sites of more than 60 anchors"),
+    *(
+        ({"site": grid_site(100.0, 90.0, 10.0, 4.0, 1.2), name: value}, f"{name} is .*; it should be left out: errors")
+        for name, value in {"noise_ps": 50.0, "search_s": 3.0, "verify_rounds": 200, "seed": 2, "optimise": 4}.items()
+    ),
 ]
-
-
-@pytest.mark.parametrize(
-    ("name", "value"), [("noise_ps", 50.0), ("search_s", 3.0), ("verify_rounds", 200), ("seed", 2), ("optimise", 4)]
-)
-def test_what_has_no_effect_on_a_plan_of_beacons_is_refused(name, value):
-    with pytest.raises(skyless.SkylessError, match=f"{name} is .*; it should be left out: errors are"):
-        skyless.plan(grid_site(100.0, 90.0, 10.0, 4.0, 1.2), **{name: value})
-
-
-@pytest.mark.parametrize(("arguments", "right"), PLAN, ids=[str(sorted(given)) for given, _ in PLAN])
-def test_mistakes_of_a_plan_are_named(arguments, right):
-    refused(right, skyless.plan, {"site": paper_lab_site(accuracy=AccuracySite())} | arguments)
-
 
 CALIBRATE = [
     ({"stays": ((1,),)}, r"stays\[0\] is \(1,\); it should be 2 or 3 finite numbers"),
@@ -468,22 +440,12 @@ CALIBRATE = [
 ]
 
 
-@pytest.mark.parametrize(("arguments", "right"), CALIBRATE, ids=[str(sorted(given)) for given, _ in CALIBRATE])
-def test_mistakes_of_a_calibration_are_named(folder, arguments, right):
-    refused(right, skyless.calibrate, {"file": folder / "tdoa-table", "anchors": synthetic.ANCHORS_M} | arguments)
-
-
 SURVEY = [
     ({}, "one with stamps of anchors"),
     ({"recording": None}, "recording is missing"),
     ({"distances": ((1, 2, 3.0),)}, r"distances\[0\] is \(1, 2, 3.0\); it should be a skyless.site.survey.facts.Tape"),
     ({"points_m": {3: (1.0,)}}, r"points_m\[3\] is \(1.0,\); it should be 2 or 3 finite numbers"),
 ]
-
-
-@pytest.mark.parametrize(("arguments", "right"), SURVEY, ids=[str(sorted(given)) for given, _ in SURVEY])
-def test_mistakes_of_a_survey_are_named(folder, arguments, right):
-    refused(right, skyless.survey_site, {"recording": folder / "tdoa-table"} | arguments)
 
 
 def test_a_lever_arm_without_a_truth_to_move_is_refused(folder, complaint):
@@ -503,7 +465,35 @@ STUDY = [
     ({"noise_ps": float("nan")}, "noise_ps is nan"),
 ]
 
+MISTAKES = {
+    skyless.simulate: SIMULATE,
+    skyless.replay: REPLAY,
+    skyless.plan: PLAN,
+    skyless.calibrate: CALIBRATE,
+    skyless.survey_site: SURVEY,
+    skyless.study: STUDY,
+}
 
-@pytest.mark.parametrize(("arguments", "right"), STUDY, ids=[str(sorted(given)) for given, _ in STUDY])
-def test_mistakes_of_a_study_are_named(arguments, right):
-    refused(right, skyless.study, {"name": "room"} | arguments)
+
+@pytest.mark.parametrize(
+    ("call", "arguments", "right"),
+    [
+        pytest.param(call, *one, id=f"{call.__name__} {sorted(one[0])}")
+        for call, mistakes in MISTAKES.items()
+        for one in mistakes
+    ],
+)
+def test_mistakes_are_named(folder, call, arguments, right):
+    """A wrong call raises one line of error that names Python's arguments, not the options of the command."""
+    tables = {"file": folder / "tdoa-table", "anchors": synthetic.ANCHORS_M}
+    usual = {
+        skyless.replay: tables,
+        skyless.plan: {"site": paper_lab_site(accuracy=AccuracySite())},
+        skyless.calibrate: tables,
+        skyless.survey_site: {"recording": folder / "tdoa-table"},
+        skyless.study: {"name": "room"},
+    }
+    with pytest.raises(skyless.SkylessError, match=right) as found:
+        call(**usual.get(call, {}) | arguments)
+    assert "\n" not in str(found.value)
+    assert "--" not in str(found.value)

@@ -4,9 +4,7 @@ import csv
 import json
 import os
 import re
-from errno import ENOSPC
 from itertools import pairwise
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -27,6 +25,7 @@ from skyless.site.tables import read_anchors, read_calibration, read_ranges
 from support import live_site
 from support.alignment import aligned_rms_m
 from support.bench import LAB
+from support.full_disk import full_disk
 
 pytestmark = pytest.mark.site
 
@@ -114,15 +113,7 @@ def test_a_full_disk_leaves_all_files_as_they_were(hall, capsys, tmp_path, monke
     """A new site file with the record of another survey would give the watch a wrong baseline."""
     out = tmp_path / "new.toml"
     out.write_text("what was there")
-    write_bytes, written = Path.write_bytes, []
-
-    def until_the_disk_is_full(path, data):
-        written.append(path)
-        if len(written) == 3:
-            raise OSError(ENOSPC, "No space left on device", str(path))
-        return write_bytes(path, data)
-
-    monkeypatch.setattr(Path, "write_bytes", until_the_disk_is_full)
+    written = full_disk(monkeypatch, 3)
     command = ("--recording", hall / "ranges.csv", "--site", hall / "site.toml", "--out", out, "--force")
     assert main(["survey", *map(str, command)]) == 2
     said = capsys.readouterr().err

@@ -99,7 +99,7 @@ class Views:
         records = records_of([(1, one)], simulated=False)
         self.gathered.on_batch(records, {1: TagName(tag, "here", 0.0)}, self.times.now_s)
         (record,) = FIELDS.iter_unpack(records.tobytes())
-        self.batched.on_batched_fix(fix_of(tag, record), self.times.now_s)
+        self.batched.add_fix(fix_of(tag, record), self.times.now_s, batched=True)
         self.batched.table.hear([tag], self.times.now_s)
 
     def end(self, tag):

@@ -87,19 +87,16 @@ def test_each_kind_has_its_unit_and_scale():
     assert sigma["height_m"] == LAB.tags.height_m
 
 
-def test_a_process_answers_as_here_says_why_it_cannot_and_is_started_again():
-    async def ask():
-        process = TaskProcess("skyless.page.overlay_process")
-        try:
-            with pytest.raises(HTTPException, match="4 anchors or more"):
-                await process.run(task(replace(LAB, anchors=LAB.anchors[:3], tags=TagsSite())))
-            process._process.kill()
-            process._process.wait()
-            return await process.run(task())
-        finally:
-            process.stop()
-
-    assert msgspec.json.decode(asyncio.run(ask()))["values"] == values()
+async def test_a_process_answers_as_here_says_why_it_cannot_and_is_started_again():
+    process = TaskProcess("skyless.page.overlay_process")
+    try:
+        with pytest.raises(HTTPException, match="4 anchors or more"):
+            await process.run(task(replace(LAB, anchors=LAB.anchors[:3], tags=TagsSite())))
+        process._process.kill()
+        process._process.wait()
+        assert msgspec.json.decode(await process.run(task()))["values"] == values()
+    finally:
+        process.stop()
 
 
 def test_anchors_are_moved_in_the_prediction_only():
@@ -111,16 +108,14 @@ def test_anchors_are_moved_in_the_prediction_only():
 
 
 @pytest.mark.statistical
-def test_nothing_is_computed_after_the_end():
-    async def ask():
-        process = TaskProcess("skyless.page.overlay_process")
-        began = asyncio.create_task(process.run(task(step_m=0.05)))
-        await asyncio.sleep(0.2)
-        process.stop()
-        waited = asyncio.create_task(process.run(task(step_m=0.1)))
-        return await asyncio.gather(began, waited, return_exceptions=True)
-
-    assert all(isinstance(answer, HTTPException) for answer in asyncio.run(ask()))
+async def test_nothing_is_computed_after_the_end():
+    process = TaskProcess("skyless.page.overlay_process")
+    began = asyncio.create_task(process.run(task(step_m=0.05)))
+    await asyncio.sleep(0.2)
+    process.stop()
+    waited = asyncio.create_task(process.run(task(step_m=0.1)))
+    answers = await asyncio.gather(began, waited, return_exceptions=True)
+    assert all(isinstance(answer, HTTPException) for answer in answers)
 
 
 def test_errors_are_predicted_without_a_master_too():

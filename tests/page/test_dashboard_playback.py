@@ -1,5 +1,6 @@
 """Recordings, written as the recorder writes them, as a page gets them back."""
 
+import contextlib
 import json
 
 import msgspec
@@ -40,6 +41,19 @@ def record(path, *, begin_s=START_S, seconds=DURATION_S, close=True, clock_error
     if close:
         recorder.file.close()
     return recorder
+
+
+@contextlib.contextmanager
+def recorded(path):
+    """A recording of the messages that the block gives, at times after ``START_S``."""
+    recorder = McapRecorder(McapFile(path))
+
+    def take(topic, message, at_s):
+        recorder.add(topic, msgspec.json.encode(message), START_S + at_s)
+        recorder.file.flush()
+
+    yield take
+    recorder.file.close()
 
 
 @pytest.fixture
@@ -183,25 +197,20 @@ def test_a_recording_is_downloaded_with_its_name_as_far_as_it_is_written(folder)
 
 def test_the_events_of_a_recording_are_those_that_a_live_page_would_have_listed(folder):
     """Anchor 1 leads and is silent from 3 s on, 2 leads from 6 s on; t1 has an alert at 8 s, 2 has moved at 13 s."""
-    recorder = McapRecorder(McapFile(folder / "events.mcap"))
-
-    def take(topic, message, at_s):
-        recorder.add(topic, msgspec.json.encode(message), START_S + at_s)
-
-    for k in range(130):
-        at_s = k / 10
-        alert = "alert-limit-exceeded" if 8.0 <= at_s < 8.5 else "none"
-        take(topics.fix_topic(SITE_ID, "t1"), fix("t1", START_S + at_s, serial=k, hpl_m=0.5, alert=alert), at_s)
-        if k % 10 == 0:
-            for anchor in (1, 2):
-                leads = anchor == 1 if at_s < 3.0 else anchor == 2 and at_s >= 6.0
-                if anchor == 2 or at_s < 3.0:
-                    role = "master" if leads else "anchor"
-                    health = anchor_health(anchor, unix_s=START_S + at_s, role=role, term=k)
-                    take(topics.health_topic(SITE_ID, "anchor", anchor), health, at_s)
-    finding = WatchFinding("moved", (2,), 0.3, 0.01, START_S, "Anchor 2 has moved by 30 cm.")
-    take(topics.watch_topic(SITE_ID), WatchMessage(START_S + 13.0, "watching", (finding,), 3), 13.0)
-    recorder.file.close()
+    with recorded(folder / "events.mcap") as take:
+        for k in range(130):
+            at_s = k / 10
+            alert = "alert-limit-exceeded" if 8.0 <= at_s < 8.5 else "none"
+            take(topics.fix_topic(SITE_ID, "t1"), fix("t1", START_S + at_s, serial=k, hpl_m=0.5, alert=alert), at_s)
+            if k % 10 == 0:
+                for anchor in (1, 2):
+                    leads = anchor == 1 if at_s < 3.0 else anchor == 2 and at_s >= 6.0
+                    if anchor == 2 or at_s < 3.0:
+                        role = "master" if leads else "anchor"
+                        health = anchor_health(anchor, unix_s=START_S + at_s, role=role, term=k)
+                        take(topics.health_topic(SITE_ID, "anchor", anchor), health, at_s)
+        finding = WatchFinding("moved", (2,), 0.3, 0.01, START_S, "Anchor 2 has moved by 30 cm.")
+        take(topics.watch_topic(SITE_ID), WatchMessage(START_S + 13.0, "watching", (finding,), 3), 13.0)
     playback = Playback(folder)
     found = playback.events("events.mcap")
     assert found.complete
@@ -218,33 +227,24 @@ def test_the_events_of_a_recording_are_those_that_a_live_page_would_have_listed(
 
 
 def test_a_recording_with_a_gap_lists_no_outage(folder):
-    recorder = McapRecorder(McapFile(folder / "cut.mcap"))
-    for at_s in (0, 1, 2, 3, 60, 61, 62):
-        health = anchor_health(1, unix_s=START_S + at_s)
-        recorder.add(topics.health_topic(SITE_ID, "anchor", 1), msgspec.json.encode(health), START_S + at_s)
-        health = anchor_health(2, unix_s=START_S + at_s)
-        recorder.add(topics.health_topic(SITE_ID, "anchor", 2), msgspec.json.encode(health), START_S + at_s + 0.1)
-    recorder.file.close()
+    with recorded(folder / "cut.mcap") as take:
+        for at_s in (0, 1, 2, 3, 60, 61, 62):
+            for anchor, later_s in ((1, 0.0), (2, 0.1)):
+                health = anchor_health(anchor, unix_s=START_S + at_s)
+                take(topics.health_topic(SITE_ID, "anchor", anchor), health, at_s + later_s)
     assert Playback(folder).events("cut.mcap").events == ()
 
 
 def test_the_summary_says_when_there_are_fixes(folder):
     """Nothing for 3 s, fixes for 2 s, nothing for 5 s, fixes for 1 s; the first is known exactly."""
-    recorder = McapRecorder(McapFile(folder / "gaps.mcap"))
-
-    def take(topic, message, at_s):
-        recorder.add(topic, msgspec.json.encode(message), START_S + at_s)
-        recorder.file.flush()
-
-    for k in range(120):
-        at_s = k / 10
-        take(topics.truth_topic(SITE_ID), truth(START_S + at_s), at_s)
-        if 3.0 <= at_s < 5.0 or at_s >= 10.0:
-            take(topics.fix_topic(SITE_ID, "t1"), fix("t1", START_S + at_s, serial=k), at_s)
-    recorder.file.close()
+    with recorded(folder / "gaps.mcap") as take:
+        for k in range(120):
+            at_s = k / 10
+            take(topics.truth_topic(SITE_ID), truth(START_S + at_s), at_s)
+            if 3.0 <= at_s < 5.0 or at_s >= 10.0:
+                take(topics.fix_topic(SITE_ID, "t1"), fix("t1", START_S + at_s, serial=k), at_s)
     spans = [[s - START_S for s in span] for span in Playback(folder).summary("gaps.mcap").fix_spans_unix_s]
     assert spans == [pytest.approx([3.0, 4.9]), pytest.approx([10.0, 11.9])]
-    empty = McapRecorder(McapFile(folder / "empty.mcap"))
-    empty.add(topics.truth_topic(SITE_ID), msgspec.json.encode(truth(START_S)), START_S)
-    empty.file.close()
+    with recorded(folder / "empty.mcap") as take:
+        take(topics.truth_topic(SITE_ID), truth(START_S), 0.0)
     assert Playback(folder).summary("empty.mcap").fix_spans_unix_s == ()

@@ -46,10 +46,9 @@ class Stage:
             self.ether.advance()
 
     def join(self, kind, *names, tx_delays_ticks=()):
-        """A client, its session (or why it has none), and its counters when it joined."""
+        """A client, and the one that is on the air, or why it is not."""
         client = Listener()
-        session = self.ether.join(client, Join(kind, names, tx_delays_ticks))
-        return client, session
+        return client, self.ether.join(client, Join(kind, names, tx_delays_ticks)) or client
 
     def ticks(self, client, node, ahead_s):
         """Counter of a client's node so far ahead, from what it was told when it joined."""

@@ -12,6 +12,7 @@ from skyless.run.mqtt.link import Link
 from skyless.run.mqtt.messages import AnchorHealth, EtherHealth, FixMessage, StatusMessage, TagHealth, TruthMessage
 from skyless.run.mqtt.topics import fix_topic, health_topic, status_topic, truth_topic
 from skyless.sim.evaluation.scenarios import COMFORT_MPS2
+from support.mqtt_brokers import stopped
 
 NEAR_S = 0.06
 """A truth is known from a message so near in time; an ether sends one every 50 ms."""
@@ -78,8 +79,7 @@ class Observer:
                 last_s = now_s
                 self._judge_waiting(now_s)
         finally:
-            link.cancel()
-            await asyncio.wait([link])
+            await stopped(link)
 
     def _judge_waiting(self, now_s):
         """Judge fixes once the truth after them is known, or will not come any more."""

@@ -21,6 +21,7 @@ from skyless.run import keys as key_files
 from skyless.run.anchor import AnchorNode, Anchors, health_of
 from skyless.run.mqtt.messages import Counters, PlacementMessage
 from support.keyed_air import START_UNIX_S
+from support.mqtt_brokers import stopped
 
 BEGIN_S = 1000.0
 """The first instant of the loop, at which ``START_UNIX_S`` is the time."""
@@ -35,6 +36,13 @@ def clock(monkeypatch):
 
     monkeypatch.setattr("time.time", lambda: START_UNIX_S + loop_s())
     monkeypatch.setattr("time.monotonic", loop_s)
+
+
+@pytest.fixture
+def keys_folder(tmp_path):
+    """A folder with the files of the first chain."""
+    put(tmp_path, FIRST)
+    return tmp_path
 
 
 class Stage:
@@ -56,8 +64,7 @@ class Stage:
         return self
 
     async def __aexit__(self, *_):
-        self._task.cancel()
-        await asyncio.wait([self._task])
+        await stopped(self._task)
 
     def frames(self):
         return [decode(transmission.frame) for _, transmission in self.radios[0].transmissions]
@@ -68,16 +75,14 @@ class Stage:
 
 
 @played
-async def test_frames_carry_codes_and_other_chains_are_used_without_a_restart(tmp_path, clock):
-    put(tmp_path, FIRST)
-
-    async with Stage(tmp_path) as stage:
+async def test_frames_carry_codes_and_other_chains_are_used_without_a_restart(keys_folder, clock):
+    async with Stage(keys_folder) as stage:
         await asyncio.sleep(5.0)
         assert all(frame.authentication is not None for frame in stage.frames())
         health = stage.health()
         assert (health.chain, health.code_fault, health.faults) == (1, None, {})
         ends_s = health.chain_ends_unix_s
-        put(tmp_path, SECOND)
+        put(keys_folder, SECOND)
         await asyncio.sleep(10.0)
         assert stage.health().chain == 1
         assert stage.health().chain_ends_unix_s >= ends_s
@@ -96,23 +101,19 @@ async def test_frames_carry_codes_and_other_chains_are_used_without_a_restart(tm
 
 
 @played
-async def test_several_anchors_share_the_files(tmp_path, clock):
-    put(tmp_path, FIRST)
-
-    async with Stage(tmp_path, "1", "2", "3") as stage:
+async def test_several_anchors_share_the_files(keys_folder, clock):
+    async with Stage(keys_folder, "1", "2", "3") as stage:
         await asyncio.sleep(1.5)
         assert {node.authentication.fault() for node in stage.anchors.nodes} == {None}
         assert len({id(node.authentication) for node in stage.anchors.nodes}) == 3
 
 
 @played
-async def test_files_that_are_copied_at_the_moment_change_nothing(tmp_path, clock):
-    put(tmp_path, FIRST)
-
-    async with Stage(tmp_path) as stage:
+async def test_files_that_are_copied_at_the_moment_change_nothing(keys_folder, clock):
+    async with Stage(keys_folder) as stage:
         await asyncio.sleep(4.0)
-        put(tmp_path, SECOND)
-        file = key_files.chain_public_file(tmp_path, 2)
+        put(keys_folder, SECOND)
+        file = key_files.chain_public_file(keys_folder, 2)
         whole = file.read_bytes()
         file.write_bytes(whole[:-9])
         await asyncio.sleep(10.0)
@@ -126,14 +127,13 @@ async def test_files_that_are_copied_at_the_moment_change_nothing(tmp_path, cloc
         assert stage.health().code_fault is None
 
 
-def test_a_chain_whose_seed_is_still_to_come_is_named(tmp_path):
-    put(tmp_path, FIRST)
+def test_a_chain_whose_seed_is_still_to_come_is_named(keys_folder):
     said = []
-    keys = key_files.AnchorKeys(tmp_path, FREE.id, said.append, {})
-    put(tmp_path, SECOND, seeds=False)
+    keys = key_files.AnchorKeys(keys_folder, FREE.id, said.append, {})
+    put(keys_folder, SECOND, seeds=False)
     assert not keys.update()
-    assert said == [f"keys: chain 2 has no seed in {tmp_path}; chain 1 stays in use"]
-    seed = key_files.chain_seed_file(tmp_path, 2)
+    assert said == [f"keys: chain 2 has no seed in {keys_folder}; chain 1 stays in use"]
+    seed = key_files.chain_seed_file(keys_folder, 2)
     seed.touch(0o600)
     seed.write_bytes(key_files.seed_bytes(SECOND))
     assert keys.update()
@@ -148,10 +148,9 @@ def test_seeds_of_the_environment(tmp_path):
         key_files.AnchorKeys(tmp_path, FREE.id, print, {})
 
 
-def test_the_end_of_the_last_chain_is_logged_once_a_day(tmp_path):
-    put(tmp_path, FIRST)
+def test_the_end_of_the_last_chain_is_logged_once_a_day(keys_folder):
     said = []
-    keys = key_files.AnchorKeys(tmp_path, FREE.id, said.append, {})
+    keys = key_files.AnchorKeys(keys_folder, FREE.id, said.append, {})
     day_s = 86_400.0
     keys.warn(keys.ends_s - 61.0 * day_s)
     assert said == []
@@ -239,18 +238,15 @@ def test_wrong_keys_are_refused_before_anything_runs(tmp_path, capsys, complaint
         (["--site-key", "KEYS", "--radio", "sniffer:/dev/null"], "it is not for sniffers, FiRa boards and phones"),
     ],
 )
-def test_wrong_options_of_a_tag_are_refused(tmp_path, complaint, arguments, words):
-    put(tmp_path, FIRST)
-    given = [str(tmp_path / "site.public") if one == "KEYS" else one for one in arguments]
+def test_wrong_options_of_a_tag_are_refused(keys_folder, complaint, arguments, words):
+    given = [str(keys_folder / "site.public") if one == "KEYS" else one for one in arguments]
     assert words in complaint("tag", "t1", "--mqtt", "none", *given)
 
 
 @played
-async def test_stamps_of_beacons_that_are_not_accepted_are_not_kept(tmp_path, clock):
+async def test_stamps_of_beacons_that_are_not_accepted_are_not_kept(keys_folder, clock):
     """A survey would use them."""
-    put(tmp_path, FIRST)
-
-    async with Stage(tmp_path) as stage:
+    async with Stage(keys_folder) as stage:
         await asyncio.sleep(1.0)
         for chains, is_kept in ((OTHER_KEYS.chains, False), ((), False), (KEYS.chains, True)):
             now_ticks = stage.radios[0].now_ticks()

@@ -111,8 +111,8 @@ async def test_a_site_that_lacks_what_the_only_target_needs_ends_the_bridge_with
 
 
 @pytest.mark.statistical
-def test_the_command_serves_readers_until_ctrl_c_and_then_says_what_it_did(tmp_path):
-    async def main():
+async def test_the_command_serves_readers_until_ctrl_c_and_then_says_what_it_did(tmp_path):
+    async with asyncio.timeout(120):
         port = free_port()
         async with contextlib.AsyncExitStack() as stack, brokered(tmp_path) as (broker, programs):
             programs.publish(site_topic(LAB.id), SiteMessage(LAB, True, 0.0), retain=True)
@@ -137,8 +137,6 @@ def test_the_command_serves_readers_until_ctrl_c_and_then_says_what_it_did(tmp_p
             out, _ = await asyncio.wait_for(process.communicate(), 30)
             assert process.returncode == 0
             assert json.loads(out)["fixes"] == 2
-
-    asyncio.run(asyncio.wait_for(main(), 120))
 
 
 async def reader_of(port):

@@ -22,7 +22,9 @@ from skyless.run.broker import BrokerSettings, StatedAddress, running_broker, st
 from skyless.run.mqtt.address import MqttAddress, mqtt_address
 from skyless.run.mqtt.connection import check_broker
 from skyless.run.mqtt.link import Link
+from support.mqtt_brokers import stopped
 from support.processes import SKYLESS, free_port, started
+from support.waiting import running, until
 
 pytestmark = pytest.mark.site
 
@@ -88,11 +90,8 @@ async def retained_by(broker, topic, name):
     """What a new subscriber gets of the broker at once."""
     reader, got = Link(broker.address, name, site=7, kind="tag"), asyncio.get_running_loop().create_future()
     reader.subscribe(topic, lambda _, payload: got.done() or got.set_result(payload))
-    task = asyncio.ensure_future(reader.run())
-    found = await asyncio.wait_for(got, 20)
-    task.cancel()
-    await asyncio.wait([task])
-    return found
+    async with running(reader.run()):
+        return await asyncio.wait_for(got, 20)
 
 
 async def test_retained_messages_survive_its_death(port, tmp_path):
@@ -104,15 +103,10 @@ async def test_retained_messages_survive_its_death(port, tmp_path):
 
     broker = await start_broker(settings)
     link = Link(broker.address, "t1", site=7, kind="tag")
-    task = asyncio.ensure_future(link.run())
     link.publish("skyless/v1/7/zones", b"kept", qos=1, retain=True)
-    while not link.connected or link.unacknowledged:
-        await asyncio.sleep(0.01)
-    while not is_written():
-        await asyncio.sleep(0.01)
-    os.kill(broker.pid, signal.SIGKILL)
-    task.cancel()
-    await asyncio.wait([task])
+    async with running(link.run()):
+        await until(lambda: link.connected and not link.unacknowledged and is_written())
+        os.kill(broker.pid, signal.SIGKILL)
     await broker.stop()
     async with await start_broker(settings) as broker:
         assert await retained_by(broker, "skyless/v1/7/zones", "t3") == b"kept"
@@ -140,8 +134,7 @@ async def test_a_broker_that_listens_elsewhere_says_so(taken, tmp_path, monkeypa
     while not (said := capsys.readouterr()).err:
         assert not serving.done(), serving
         await asyncio.sleep(0.05)
-    serving.cancel()
-    await asyncio.wait([serving])
+    await stopped(serving)
     assert f"port {taken} is taken" in said.err
     assert f"this one listens at {mqtt_address(said.out.strip()).port};" in said.err
 
@@ -174,10 +167,10 @@ async def test_data_of_a_broker_that_was_killed_with_its_owner_are_deleted_by_th
     (abandoned / "jetstream").mkdir(parents=True)
     os.utime(abandoned, (0.0, 0.0))
 
-    async with await start_broker(BrokerSettings(temporary=True)) as running:
-        os.utime(running.data, (0.0, 0.0))
+    async with await start_broker(BrokerSettings(temporary=True)) as first:
+        os.utime(first.data, (0.0, 0.0))
         async with await start_broker(BrokerSettings(temporary=True)) as other:
-            assert {*tmp_path.iterdir()} == {running.data, other.data}
+            assert {*tmp_path.iterdir()} == {first.data, other.data}
 
 
 async def test_a_home_that_cannot_be_written_costs_nothing(tmp_path, monkeypatch):

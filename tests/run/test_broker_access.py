@@ -1,7 +1,6 @@
 """Roles at the embedded broker: each may do exactly what the table says."""
 
 import asyncio
-import inspect
 import re
 
 import pytest
@@ -14,7 +13,7 @@ from skyless.run.mqtt import topics
 from skyless.run.mqtt.address import ACCESS, USERS, MqttAddress, Role, create_access, read_access
 from skyless.run.mqtt.connection import check_broker
 from skyless.run.mqtt.link import Link
-from support.mqtt_brokers import Embedded
+from support.mqtt_brokers import Embedded, stopped
 from support.waiting import until
 
 pytestmark = pytest.mark.site
@@ -26,11 +25,9 @@ NODES = {topics.status_topic: (*KINDS, "doctor"), topics.health_topic: ("tag", "
 def every_topic():
     """All topics of Skyless, of two sites and one node of each kind, and some that are none of them."""
     found = []
-    for name, function in inspect.getmembers(topics, inspect.isfunction):
-        count = len(inspect.signature(function).parameters)
-        assert name.endswith("_topic")
-        nodes = [(kind, "n1") for kind in NODES.get(function, ())] or [("n1", "n2")[: count - 1]]
-        found += [function(site, *words) for site in (7, 8) for words in nodes]
+    for topic in (one for one in vars(topics).values() if isinstance(one, topics.Topic)):
+        nodes = [(kind, "n1") for kind in NODES.get(topic, ())] or [("n1", "n2")[: topic.levels.count("+")]]
+        found += [topic(site, *words) for site in (7, 8) for words in nodes]
     assert len(set(found)) == len(found) > 25
     others = ["homeassistant/status", "homeassistant/device/skyless-7-t/config", "homeassistant/switch/x/set"]
     return found + others + ["skyless/v2/7/site", "skyless/v1/7/tag/n1/fix/more", "skyless", "other"]
@@ -245,8 +242,7 @@ def test_a_program_of_the_wrong_role_is_warned(role, make_access, caplog, monkey
         link = Link(access.address(role), "n1", site=7, kind="tag")
         task = asyncio.ensure_future(link.run())
         await until(lambda: "has not returned skyless/v1/7/tag/n1/status" in caplog.text)
-        task.cancel()
-        await asyncio.wait([task])
+        await stopped(task)
 
     asyncio.run(check())
     assert ("a subscription to skyless/v1/7/tag/n1/status" in caplog.text) == (role is Role.ANCHORS)
@@ -264,8 +260,7 @@ def test_a_program_of_the_right_role_is_not_warned(make_access, caplog):
         task = asyncio.ensure_future(link.run())
         await until(lambda: returned and not link.unacknowledged)
         link._check_echo(link._connection)
-        task.cancel()
-        await asyncio.wait([task])
+        await stopped(task)
 
     asyncio.run(check())
     assert caplog.text == ""

@@ -10,6 +10,7 @@ import pytest
 
 from skyless.run import process
 from skyless.run.process import Child, Program, end
+from support.mqtt_brokers import stopped
 from support.processes import free_port
 from support.waiting import until
 
@@ -25,8 +26,7 @@ def alive(pid):
 
 
 async def stop(task):
-    task.cancel()
-    await asyncio.wait([task])
+    await stopped(task)
 
 
 async def first_line(monkeypatch, code, name, **options):

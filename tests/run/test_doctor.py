@@ -164,19 +164,16 @@ async def test_a_port_that_is_not_there_is_told_and_so_is_a_device_of_another_ki
 
 
 @pytest.mark.live
-def test_a_board_at_a_running_site_is_well(tmp_path):
-    async def play():
-        async with LiveSite(tmp_path) as site:
-            for number in (1, 2, 3, 4, 5, 6):
-                site.anchor(number, site.air)
-            site.plug_in("tag1")
-            probe = BoardProbe(SerialRadio(str(tmp_path / "tag1"), 1_000_000, "tag1"), None)
-            listening = asyncio.ensure_future(probe.run())
-            await until(lambda: probe.checks(NoiseSite())[1:2] and probe.checks(NoiseSite())[1].result == "ok", 30.0)
-            listening.cancel()
-            return probe.checks(NoiseSite())
-
-    board, reception, clock = asyncio.run(play())
+async def test_a_board_at_a_running_site_is_well(tmp_path):
+    async with LiveSite(tmp_path) as site:
+        for number in (1, 2, 3, 4, 5, 6):
+            site.anchor(number, site.air)
+        site.plug_in("tag1")
+        probe = BoardProbe(SerialRadio(str(tmp_path / "tag1"), 1_000_000, "tag1"), None)
+        listening = asyncio.ensure_future(probe.run())
+        await until(lambda: probe.checks(NoiseSite())[1:2] and probe.checks(NoiseSite())[1].result == "ok", 30.0)
+        listening.cancel()
+        board, reception, clock = probe.checks(NoiseSite())
     assert (board.result, reception.result) == ("ok", "ok")
     assert "serial link" in board.finding
     assert "6 anchors" in reception.finding

@@ -19,6 +19,7 @@ from skyless.run.mqtt.topics import site_topic, status_topic
 from skyless.sim.lab import lab_site
 from support.mqtt_brokers import Embedded
 from support.processes import SKYLESS, free_port
+from support.waiting import running
 
 pytestmark = pytest.mark.site
 
@@ -44,15 +45,11 @@ async def publish(address, *messages):
 async def alive(address, number, name):
     """The emulated air of a site, online."""
     link = Link(address, "air", site=number, kind="ether")
-    running = asyncio.create_task(link.run())
     link.publish(*site_message(number, name), qos=1, retain=True)
-    while not link.connected or link.unacknowledged:
-        await asyncio.sleep(0.01)
-    try:
+    async with running(link.run()):
+        while not link.connected or link.unacknowledged:
+            await asyncio.sleep(0.01)
         yield
-    finally:
-        running.cancel()
-        await asyncio.gather(running, return_exceptions=True)
 
 
 async def alive_at_the_broker(address, *numbers):
@@ -64,11 +61,9 @@ async def alive_at_the_broker(address, *numbers):
             found.set()
 
     while not found.is_set():
-        watching = asyncio.create_task(watch_sites(address, on_sites))
-        with contextlib.suppress(TimeoutError):
-            await asyncio.wait_for(found.wait(), 2.0)
-        watching.cancel()
-        await asyncio.gather(watching, return_exceptions=True)
+        async with running(watch_sites(address, on_sites)):
+            with contextlib.suppress(TimeoutError):
+                await asyncio.wait_for(found.wait(), 2.0)
 
 
 async def test_a_site_of_which_nothing_is_online_is_not_chosen_though_its_number_is_lower(tmp_path, caplog):

@@ -318,7 +318,7 @@ def test_an_address_lists_the_servers_of_a_hub_with_commas_and_may_leave_its_pas
     assert nats_address("nats://ann:own@here") == NatsAddress("nats://here:4222", "ann", "own")
 
 
-def test_the_broker_runs_a_gather_and_states_its_address(tmp_path):
+async def test_the_broker_runs_a_gather_and_states_its_address(tmp_path):
     options = ("--data", str(tmp_path / "store"), "--gather", "--site-id", str(SITE), "--json")
     with started(*SKYLESS, "broker", *options, stderr=None) as process:
         stated = msgspec.json.decode(process.stdout.readline())
@@ -326,16 +326,12 @@ def test_the_broker_runs_a_gather_and_states_its_address(tmp_path):
         mqtt = mqtt_address(stated["mqtt"])
         assert nats_of(mqtt) == address
         assert nats_of(replace(mqtt, port=1)) is None
-
-        async def check():
-            async with client_of(address) as client:
-                await serving(client)
-                await publish(client, "a", 0.0)
-                rows, names = await stored(address, 1)
-                assert rows == [(MAX_RECORDS, 1, 0)]
-                assert names == {1: "a"}
-
-        asyncio.run(check())
+        async with client_of(address) as client:
+            await serving(client)
+            await publish(client, "a", 0.0)
+            rows, names = await stored(address, 1)
+            assert rows == [(MAX_RECORDS, 1, 0)]
+            assert names == {1: "a"}
         process.send_signal(signal.SIGINT)
         assert process.wait(20) == 0
 

@@ -1,6 +1,7 @@
 """``skyless history run`` against real brokers: killed, with a full disk, and what it takes of a site's messages."""
 
 import asyncio
+import contextlib
 import errno
 import multiprocessing
 import os
@@ -28,6 +29,7 @@ from skyless.run.history.layout import current_events, current_files, rows_of, s
 from skyless.run.history.program import HistoryNode, import_recording
 from skyless.run.history.queries import History
 from skyless.run.history.writer import Keep, Writer
+from skyless.run.mqtt import topics
 from skyless.run.mqtt.address import MqttAddress, Role, create_access, mqtt_address, read_access
 from skyless.run.mqtt.link import Link
 from skyless.run.mqtt.messages import (
@@ -39,15 +41,6 @@ from skyless.run.mqtt.messages import (
     Zone,
     ZoneEvent,
     ZonesMessage,
-)
-from skyless.run.mqtt.topics import (
-    alarm_topic,
-    assets_topic,
-    fix_topic,
-    site_topic,
-    status_topic,
-    zone_event_topic,
-    zones_topic,
 )
 from skyless.run.record import RecorderNode
 from skyless.run.recordings.recorder import McapFile
@@ -89,14 +82,13 @@ class Stage:
         return self
 
     async def __aexit__(self, *_):
-        self._task.cancel()
-        await asyncio.wait([self._task])
+        await stopped(self._task)
         await self.broker.stop()
 
     async def publish_fixes(self):
         """Until cancelled: 200 a second, each with the next serial."""
         for serial in count(1):
-            self.link.publish(fix_topic(SITE, TAG), numbered_fix(serial))
+            self.link.publish(topics.fix_topic(SITE, TAG), numbered_fix(serial))
             await asyncio.sleep(0.005)
 
 
@@ -133,27 +125,10 @@ class Sender:
 
 
 @pytest.mark.statistical
-def test_fifty_kills_lose_no_acknowledged_batch_and_double_none(tmp_path):
+async def test_fifty_kills_lose_no_acknowledged_batch_and_double_none(tmp_path):
     folder, chance = tmp_path / "history", random.Random(50)
     processes = multiprocessing.get_context("forkserver")
     processes.set_forkserver_preload(["skyless.run.history.program", "skyless.run.zones"])  # for a quick start
-
-    async def scenario():
-        async with Stage(tmp_path / "broker", gathered_bytes=10**9) as stage:
-            sender = Sender(stage.broker.broker.nats)
-            sending = asyncio.ensure_future(sender.run())
-            for _ in range(50):
-                process = begun(stage)
-                await asyncio.sleep(chance.uniform(0.0, 1.5))
-                assert process.exitcode is None
-                process.kill()
-                process.join()
-            await stopped(sending)
-            process = begun(stage)
-            await until(lambda: kept() >= 3 * sender.batches and len(zones()) >= sender.events, 300.0)
-            process.kill()
-            process.join()
-            return sender
 
     def begun(stage):
         given = (folder, SITE, stage.broker.address, stage.broker.broker.nats)
@@ -169,7 +144,20 @@ def test_fifty_kills_lose_no_acknowledged_batch_and_double_none(tmp_path):
         texts = [text for file in files for text in parquet.read_table(file, partitioning=None)["text"].to_pylist()]
         return [int(text.split()[-1]) for text in texts if "entered" in text]
 
-    sender = asyncio.run(scenario())
+    async with Stage(tmp_path / "broker", gathered_bytes=10**9) as stage:
+        sender = Sender(stage.broker.broker.nats)
+        sending = asyncio.ensure_future(sender.run())
+        for _ in range(50):
+            process = begun(stage)
+            await asyncio.sleep(chance.uniform(0.0, 1.5))
+            assert process.exitcode is None
+            process.kill()
+            process.join()
+        await stopped(sending)
+        process = begun(stage)
+        await until(lambda: kept() >= 3 * sender.batches and len(zones()) >= sender.events, 300.0)
+        process.kill()
+        process.join()
     assert sender.batches > 500
     assert len(current_files(folder, SITE)) > 20
     found = sorted(in_files(folder, SITE))  # a batch or an event that was not acknowledged may be there
@@ -179,17 +167,17 @@ def test_fifty_kills_lose_no_acknowledged_batch_and_double_none(tmp_path):
     assert numbers == [*range(1, len(found) + 1)]
 
 
-async def keeping(stage, folder, log, scenario):
-    """Run a node in this process during a scenario."""
+@contextlib.asynccontextmanager
+async def keeping(stage, folder, log):
+    """A node that runs in this process, once it is connected."""
     node = HistoryNode(folder, SITE, stage.broker.address, Keep(), log)
     async with running(node.run()) as (task,):
         await until(lambda: node.link.connected or task.done())
-        await scenario(node)
-    return node
+        yield node
 
 
 @pytest.mark.parametrize("number", [errno.ENOSPC, errno.EROFS])
-def test_a_disk_that_takes_nothing_is_said_and_forgiven(tmp_path, monkeypatch, number):
+async def test_a_disk_that_takes_nothing_is_said_and_forgiven(tmp_path, monkeypatch, number):
     folder, lines = tmp_path / "history", []
     monkeypatch.setattr(program, "_CHECK_S", 0.05)
     monkeypatch.setattr(program, "_FIRST_FILE_S", 0.1)
@@ -205,8 +193,7 @@ def test_a_disk_that_takes_nothing_is_said_and_forgiven(tmp_path, monkeypatch, n
 
     monkeypatch.setattr(Path, "write_bytes", write)
 
-    async def scenario(node):
-        nonlocal is_at_fault
+    async with Stage(tmp_path / "broker") as stage, keeping(stage, folder, lines.append) as node:
         publishing = asyncio.ensure_future(stage.publish_fixes())
         await until(lambda: node.state().disk is not None)
         during = node.state()
@@ -217,13 +204,6 @@ def test_a_disk_that_takes_nothing_is_said_and_forgiven(tmp_path, monkeypatch, n
         later = node.state().fixes + 100
         await until(lambda: node.state().fixes > later and current_files(folder, SITE))
         publishing.cancel()
-
-    async def whole():
-        async with stage:
-            return await keeping(stage, folder, lines.append, scenario)
-
-    stage = Stage(tmp_path / "broker")
-    node = asyncio.run(whole())
     assert lines[:3] == [
         f"the history's files cannot be written: {os.strerror(number)}",
         "the history's files can be written again",
@@ -237,7 +217,7 @@ ZONE = Zone("z1", "door", ((0.0, 0.0), (1.0, 0.0), (1.0, 1.0)))
 
 
 @pytest.mark.parametrize("kind", [Embedded, Mosquitto])
-def test_what_it_takes_of_a_sites_messages(tmp_path, kind):
+async def test_what_it_takes_of_a_sites_messages(tmp_path, kind):
     if kind is Mosquitto and not MOSQUITTO:
         pytest.skip("mosquitto is not installed")
     folder = tmp_path / "history"
@@ -245,41 +225,45 @@ def test_what_it_takes_of_a_sites_messages(tmp_path, kind):
     alarm = AlarmMessage(*("cold/ann/1", "cold", "Cold", "inside", "critical", "ann", now_s, now_s, "ann is in Cold"))
     ended = msgspec.structs.replace(alarm, ended_unix_s=now_s + 1.0)
 
-    async def scenario(node):
+    async with Stage(tmp_path / "broker", kind) as stage:
         publish = stage.link.publish
-        await until(lambda: node.state().events == 1)  # the tag's own status: it has subscribed
-        lab = msgspec.structs.replace(lab_site(), id=SITE)
-        publish(site_topic(SITE), SiteMessage(lab, True, now_s), qos=1, retain=True)
-        publish(zones_topic(SITE), ZonesMessage((ZONE,)), qos=1, retain=True)
-        publish(assets_topic(SITE), AssetsMessage((Asset(TAG, "Forklift"), Asset("bob"))), qos=1, retain=True)
-        publish(status_topic(SITE, "anchor", 3), StatusMessage(True, "anchor", "3", unix_s=now_s), qos=1, retain=True)
-        publish(status_topic(SITE, "anchor", "a b"), StatusMessage(True, "anchor", "a b", unix_s=now_s), qos=1)
-        publish(alarm_topic(SITE, "cold", "ann"), alarm, qos=1, retain=True)
-        publish(zone_event_topic(SITE, "z1"), ZoneEvent("z1", "door", "ann", "enter", now_s, (0.0, 0.0, 0.0)), qos=1)
-        publish(fix_topic(SITE, "bad"), b"{}")
-        await until(lambda: (site_folder(folder, SITE) / "stream").is_dir() and node.state().events >= 4)
-        await until(lambda: node.state().drops.get("wrong"))
-        publish(zones_topic(SITE), b'{"zones": [{"id": "/", "name": "", "polygon_m": []}]}', qos=1)
-        await until(lambda: node.state().drops.get("wrong-message"))
-        publish(fix_topic(SITE, TAG), numbered_fix(1))
-        await until(lambda: node.state().fixes == 1)
-
-    async def again(node):
-        publish = stage.link.publish
-        while not node.state().fixes:  # nats-server may lose what comes while somebody subscribes
-            publish(fix_topic(SITE, TAG), numbered_fix(2))
-            await asyncio.sleep(0.05)
-        publish(status_topic(SITE, "anchor", 3), StatusMessage(False, "anchor", "3"), qos=1, retain=True)
-        publish(alarm_topic(SITE, "cold", "ann"), ended, qos=1, retain=True)
-        await until(lambda: node.state().events >= 2)
-
-    async def whole():
-        async with stage:
-            await keeping(stage, folder, lambda _: None, scenario)
-            await keeping(stage, folder, lambda _: None, again)
-
-    stage = Stage(tmp_path / "broker", kind)
-    asyncio.run(whole())
+        async with keeping(stage, folder, lambda _: None) as node:
+            await until(lambda: node.state().events == 1)  # the tag's own status: it has subscribed
+            lab = msgspec.structs.replace(lab_site(), id=SITE)
+            publish(topics.site_topic(SITE), SiteMessage(lab, True, now_s), qos=1, retain=True)
+            publish(topics.zones_topic(SITE), ZonesMessage((ZONE,)), qos=1, retain=True)
+            publish(
+                topics.assets_topic(SITE), AssetsMessage((Asset(TAG, "Forklift"), Asset("bob"))), qos=1, retain=True
+            )
+            publish(
+                topics.status_topic(SITE, "anchor", 3),
+                StatusMessage(True, "anchor", "3", unix_s=now_s),
+                qos=1,
+                retain=True,
+            )
+            publish(
+                topics.status_topic(SITE, "anchor", "a b"), StatusMessage(True, "anchor", "a b", unix_s=now_s), qos=1
+            )
+            publish(topics.alarm_topic(SITE, "cold", "ann"), alarm, qos=1, retain=True)
+            publish(
+                topics.zone_event_topic(SITE, "z1"),
+                ZoneEvent("z1", "door", "ann", "enter", now_s, (0.0, 0.0, 0.0)),
+                qos=1,
+            )
+            publish(topics.fix_topic(SITE, "bad"), b"{}")
+            await until(lambda: (site_folder(folder, SITE) / "stream").is_dir() and node.state().events >= 4)
+            await until(lambda: node.state().drops.get("wrong"))
+            publish(topics.zones_topic(SITE), b'{"zones": [{"id": "/", "name": "", "polygon_m": []}]}', qos=1)
+            await until(lambda: node.state().drops.get("wrong-message"))
+            publish(topics.fix_topic(SITE, TAG), numbered_fix(1))
+            await until(lambda: node.state().fixes == 1)
+        async with keeping(stage, folder, lambda _: None) as node:
+            while not node.state().fixes:  # nats-server may lose what comes while somebody subscribes
+                publish(topics.fix_topic(SITE, TAG), numbered_fix(2))
+                await asyncio.sleep(0.05)
+            publish(topics.status_topic(SITE, "anchor", 3), StatusMessage(False, "anchor", "3"), qos=1, retain=True)
+            publish(topics.alarm_topic(SITE, "cold", "ann"), ended, qos=1, retain=True)
+            await until(lambda: node.state().events >= 2)
     assert History(folder, SITE).assets() == {TAG: "Forklift"}
     found = [parquet.read_table(file, partitioning=None).to_pylist() for file in current_events(folder, SITE)]
     kinds = sorted((row["kind"], row["tag"] or row["subject"]) for table in found for row in table)
@@ -297,7 +281,7 @@ def test_what_it_takes_of_a_sites_messages(tmp_path, kind):
     assert zones["zone"].to_pylist() == ["z1"]
 
 
-def test_a_recording_gives_the_rows_of_the_running_history(tmp_path):
+async def test_a_recording_gives_the_rows_of_the_running_history(tmp_path):
     live, played, walk = tmp_path / "live", tmp_path / "played", tmp_path / "walk.mcap"
     chance, lab = random.Random(7), msgspec.structs.replace(lab_site(), id=SITE)
 
@@ -305,41 +289,33 @@ def test_a_recording_gives_the_rows_of_the_running_history(tmp_path):
         at_m, variances = ([chance.uniform(*limits) for _ in range(3)] for limits in ((-50.0, 50.0), (1e-6, 4.0)))
         return fix(f"t{serial % 3}", serial, time.time(), tuple(at_m), variances, hpl_m=chance.uniform(0.1, 9.0))
 
-    async def scenario(node):
+    stage = Stage(tmp_path / "broker")
+    recorder = RecorderNode(McapFile(walk), stage.broker.address, SITE, print)
+    async with stage, running(recorder.run()), keeping(stage, live, print) as node:
         await until(lambda: node.state().events == 1 and recorder.recorder.kinds["status"])
         publish, now_s = stage.link.publish, time.time()
-        publish(site_topic(SITE), SiteMessage(lab, True, now_s), qos=1, retain=True)
-        publish(zones_topic(SITE), ZonesMessage((ZONE,)), qos=1, retain=True)
-        publish(assets_topic(SITE), AssetsMessage((Asset("t0", "Forklift"),)), qos=1, retain=True)
+        publish(topics.site_topic(SITE), SiteMessage(lab, True, now_s), qos=1, retain=True)
+        publish(topics.zones_topic(SITE), ZonesMessage((ZONE,)), qos=1, retain=True)
+        publish(topics.assets_topic(SITE), AssetsMessage((Asset("t0", "Forklift"),)), qos=1, retain=True)
         await until(lambda: recorder.recorder.kinds["assets"])
         for serial in range(1, 301):
             made = walked(serial)
-            publish(fix_topic(SITE, made.tag), made)
+            publish(topics.fix_topic(SITE, made.tag), made)
             if serial % 50 == 0:
                 event = ZoneEvent("z1", "door", made.tag, "enter", made.unix_s, made.position_m)
-                publish(zone_event_topic(SITE, "z1"), event, qos=1)
+                publish(topics.zone_event_topic(SITE, "z1"), event, qos=1)
                 raised = AlarmMessage(
                     f"cold/{serial}", "cold", "Cold", "inside", "critical", made.tag, now_s, now_s, "in"
                 )
-                publish(alarm_topic(SITE, "cold", made.tag), raised, qos=1, retain=True)
+                publish(topics.alarm_topic(SITE, "cold", made.tag), raised, qos=1, retain=True)
                 publish(
-                    status_topic(SITE, "anchor", 3),
+                    topics.status_topic(SITE, "anchor", 3),
                     StatusMessage(serial % 100 > 0, "anchor", "3", unix_s=made.unix_s),
                     qos=1,
                 )
             await asyncio.sleep(0.002)
         await until(lambda: (node.state().fixes, node.state().events) == (300, 1 + 6 + 6 + 6))
         await until(lambda: recorder.recorder.kinds["fix"] == 300 and recorder.recorder.kinds["event"] == 6)
-
-    async def whole():
-        async with stage:
-            recording = asyncio.ensure_future(recorder.run())
-            await keeping(stage, live, print, scenario)
-            await stopped(recording)
-
-    stage = Stage(tmp_path / "broker")
-    recorder = RecorderNode(McapFile(walk), stage.broker.address, SITE, print)
-    asyncio.run(whole())
     for folder, fixes, events in ((played, 300, 19), (live, 0, 0)):
         with McapRecording(walk) as recording:
             writer = Writer(folder, SITE)
@@ -366,55 +342,46 @@ def whole_rows(folder):
 TABLES = "names", "zones", "assets"
 
 
-def test_without_a_gather_one_runs_at_the_brokers_own_streams(tmp_path):
+async def test_without_a_gather_one_runs_at_the_brokers_own_streams(tmp_path):
     folder = tmp_path / "history"
 
-    async def scenario():
-        async with Stage(tmp_path / "broker", gathered_bytes=10**9) as stage:
-            node = HistoryNode(folder, SITE, stage.broker.address, Keep(), print, stage.broker.broker.nats)
-            task = asyncio.ensure_future(node.run())
-            publishing = asyncio.ensure_future(stage.publish_fixes())
-            await until(lambda: node.state().fixes > 20 and node.state().events)
-            await stopped(publishing)
-            await stopped(task)
-            return node.state()
-
-    state = asyncio.run(scenario())
+    async with Stage(tmp_path / "broker", gathered_bytes=10**9) as stage:
+        node = HistoryNode(folder, SITE, stage.broker.address, Keep(), print, stage.broker.broker.nats)
+        task = asyncio.ensure_future(node.run())
+        publishing = asyncio.ensure_future(stage.publish_fixes())
+        await until(lambda: node.state().fixes > 20 and node.state().events)
+        await stopped(publishing)
+        await stopped(task)
+        state = node.state()
     found = in_files(folder, SITE)
     assert found == list(range(found[0], found[0] + state.fixes))
     assert (state.waiting, state.drops, (site_folder(folder, SITE) / "stream").exists()) == (0, {}, False)
 
 
-def test_a_broker_keeps_the_history_of_the_sites_on_it(tmp_path):
+async def test_a_broker_keeps_the_history_of_the_sites_on_it(tmp_path):
     """With roles: its history may read everything, and publish nothing but its status."""
     folder, access, port = tmp_path / "history", tmp_path / "access", free_port()
     create_access(access, mqtt_address("mqtt://127.0.0.1"))
     words = ("broker", "--port", str(port), "--data", tmp_path / "store", "--access", access, "--history", folder)
 
-    async def scenario():
-        pipes = {"stdout": asyncio.subprocess.PIPE, "stderr": asyncio.subprocess.PIPE}
-        async with running_program(*SKYLESS, *words, **pipes) as process:
-            await process.stdout.readline()
-            address = MqttAddress("127.0.0.1", port, user="operator", password=read_access(access)[Role.OPERATOR])
-            link, statuses = Link(address, TAG, site=SITE, kind="tag"), []
-            link.subscribe(status_topic(SITE, "history", "+"), lambda _, payload: statuses.append(payload), qos=1)
-            lab = msgspec.structs.replace(lab_site(), id=SITE)
-            link.publish(site_topic(SITE), SiteMessage(lab, False, time.time()), qos=1, retain=True)
-            task = asyncio.ensure_future(link.run())
-            await until(lambda: statuses)
-            serials, blocks = count(1), "stream/jetstream/*/streams/FIX_*/msgs/*.blk"
-            while (
-                not any(file.stat().st_size for file in site_folder(folder, SITE).glob(blocks)) or next(serials) < 200
-            ):
-                link.publish(fix_topic(SITE, TAG), numbered_fix(next(serials)))
-                await asyncio.sleep(0.02)
-            process.send_signal(signal.SIGTERM)
-            _, err = await process.communicate()
-            await stopped(task)
-            return process.returncode, err, statuses
-
-    code, err, statuses = asyncio.run(scenario())
-    assert (code, b"Traceback" in err) == (0, False), err
+    pipes = {"stdout": asyncio.subprocess.PIPE, "stderr": asyncio.subprocess.PIPE}
+    async with running_program(*SKYLESS, *words, **pipes) as process:
+        await process.stdout.readline()
+        address = MqttAddress("127.0.0.1", port, user="operator", password=read_access(access)[Role.OPERATOR])
+        link, statuses = Link(address, TAG, site=SITE, kind="tag"), []
+        link.subscribe(topics.status_topic(SITE, "history", "+"), lambda _, payload: statuses.append(payload), qos=1)
+        lab = msgspec.structs.replace(lab_site(), id=SITE)
+        link.publish(topics.site_topic(SITE), SiteMessage(lab, False, time.time()), qos=1, retain=True)
+        task = asyncio.ensure_future(link.run())
+        await until(lambda: statuses)
+        serials, blocks = count(1), "stream/jetstream/*/streams/FIX_*/msgs/*.blk"
+        while not any(file.stat().st_size for file in site_folder(folder, SITE).glob(blocks)) or next(serials) < 200:
+            link.publish(topics.fix_topic(SITE, TAG), numbered_fix(next(serials)))
+            await asyncio.sleep(0.02)
+        process.send_signal(signal.SIGTERM)
+        _, err = await process.communicate()
+        await stopped(task)
+    assert (process.returncode, b"Traceback" in err) == (0, False), err
     assert b'"online":true' in statuses[0]
     found = in_files(folder, SITE)
     assert found == sorted(set(found)) != []

@@ -20,12 +20,9 @@ def node_ports():
     return [free_node_port() for _ in range(3)]
 
 
-def test_every_fix_is_in_the_history_once_after_kills_and_cuts(tmp_path):
-    async def run():
-        async with Stage(tmp_path, node_ports(), free_port()) as stage:
-            return await at_random(stage, seed=1, actions=8)
-
-    assert asyncio.run(run())
+async def test_every_fix_is_in_the_history_once_after_kills_and_cuts(tmp_path):
+    async with Stage(tmp_path, node_ports(), free_port()) as stage:
+        assert await at_random(stage, seed=1, actions=8)
 
 
 async def until_healthy(port):
@@ -37,26 +34,22 @@ async def until_healthy(port):
         await asyncio.sleep(0.2)
 
 
-def test_servers_are_upgraded_one_after_the_other_and_the_history_has_all(tmp_path):
-    async def run():
-        ports = node_ports()
-        async with Stage(tmp_path, ports, free_port()) as stage:
-            history = HubHistory(tmp_path / "history", stage.address, None, Keep(), print)
-            keeping = asyncio.ensure_future(history.run())
-            async with asyncio.timeout(300):
-                for port, server in zip(ports, stage.servers, strict=True):
-                    await until_healthy(port)
-                    server.kill(signal.SIGTERM)
-                    server.start()
-                    await until_healthy(port)
-                await stage.stop_sending()
-                while (state := history.state()).fixes < stage.acknowledged * RECORDS:
-                    await asyncio.sleep(0.2)
-            found = await stage.sequences()
-            keeping.cancel()
-            await asyncio.gather(keeping, return_exceptions=True)
-            return found, state, stage.acknowledged
-
-    found, state, sent = asyncio.run(run())
-    assert found == list(range(1, sent + 1))
-    assert (state.fixes, state.drops) == (sent * RECORDS, {})
+async def test_servers_are_upgraded_one_after_the_other_and_the_history_has_all(tmp_path):
+    ports = node_ports()
+    async with Stage(tmp_path, ports, free_port()) as stage:
+        history = HubHistory(tmp_path / "history", stage.address, None, Keep(), print)
+        keeping = asyncio.ensure_future(history.run())
+        async with asyncio.timeout(300):
+            for port, server in zip(ports, stage.servers, strict=True):
+                await until_healthy(port)
+                server.kill(signal.SIGTERM)
+                server.start()
+                await until_healthy(port)
+            await stage.stop_sending()
+            while (state := history.state()).fixes < stage.acknowledged * RECORDS:
+                await asyncio.sleep(0.2)
+        found = await stage.sequences()
+        keeping.cancel()
+        await asyncio.gather(keeping, return_exceptions=True)
+    assert found == list(range(1, stage.acknowledged + 1))
+    assert (state.fixes, state.drops) == (stage.acknowledged * RECORDS, {})

@@ -16,7 +16,7 @@ from skyless.run.mqtt import messages, topics
 from skyless.run.mqtt.link import Link
 from skyless.site.file.load import load_site
 from skyless.site.survey.facts import Facts, Gauge
-from support.mqtt_brokers import MOSQUITTO, Mosquitto
+from support.mqtt_brokers import MOSQUITTO, Mosquitto, stopped
 from support.processes import free_port
 from support.waiting import until
 
@@ -139,8 +139,7 @@ async def ended(fresh, link):
     assert pids == [None] * len(pids), "a program ended by itself"
     codes = [await program.stop() for program in reversed(fresh.programs)]
     await asyncio.sleep(0.2)
-    link.cancel()
-    await asyncio.wait([link])
+    await stopped(link)
     return codes
 
 

@@ -76,30 +76,27 @@ def test_beyond_a_thousand_connections_processes_are_served_as_before():
     in_program_loop(main())
 
 
-def test_when_no_connection_is_left_others_are_refused_with_the_reason_and_those_that_stand_go_on():
-    async def main():
-        async with air(most=2) as (ether, port, logged):
-            message, first = await answer(port)
-            assert isinstance(message, Joined)
-            _, idle = await asyncio.open_connection(HOST, port)
-            await until(lambda: ether.connections == 2)
-            for _ in range(3):
-                message, writer = await answer(port, joins=False)
-                assert message == Refused("all 2 connections of the ether are in use")
-                writer.close()
-            assert logged == ["all 2 connections are in use (limit: ulimit -n); others are refused, these go on"]
-            assert len(ether._owners) == 1
-            idle.close()
-            await until(lambda: ether.connections == 1)
-            first.close()
-            await until(lambda: not ether.connections)
-            message, again = await answer(port)  # there is room again
-            assert isinstance(message, Joined)
-            again.close()
-            await until(lambda: not ether.connections)
-            ether._timer.cancel()
-
-    in_program_loop(main())
+async def test_when_no_connection_is_left_others_are_refused_with_the_reason_and_those_that_stand_go_on():
+    async with air(most=2) as (ether, port, logged):
+        message, first = await answer(port)
+        assert isinstance(message, Joined)
+        _, idle = await asyncio.open_connection(HOST, port)
+        await until(lambda: ether.connections == 2)
+        for _ in range(3):
+            message, writer = await answer(port, joins=False)
+            assert message == Refused("all 2 connections of the ether are in use")
+            writer.close()
+        assert logged == ["all 2 connections are in use (limit: ulimit -n); others are refused, these go on"]
+        assert len(ether._owners) == 1
+        idle.close()
+        await until(lambda: ether.connections == 1)
+        first.close()
+        await until(lambda: not ether.connections)
+        message, again = await answer(port)  # there is room again
+        assert isinstance(message, Joined)
+        again.close()
+        await until(lambda: not ether.connections)
+        ether._timer.cancel()
 
 
 def test_a_program_asks_for_as_many_files_as_it_may_have_and_not_for_billions(monkeypatch):

@@ -100,6 +100,8 @@ class Recorder:
 @contextlib.asynccontextmanager
 async def site(broker):
     """Two tags and one who tells the site, on a broker that runs."""
+    for place in PLACES:
+        tape(LAB, SECONDS, 1, place)  # made before the clock runs
     await broker.start()
     teller = Link(broker.address, "teller", site=LAB.id, kind="ether")
     teller.publish(site_topic(LAB.id), SiteMessage(LAB, True, time.time()), qos=1, retain=True)
@@ -114,17 +116,6 @@ async def site(broker):
             task.cancel()
         await asyncio.wait(tasks)
         await broker.stop()
-
-
-def run(scenario, broker):
-    for place in PLACES:
-        tape(LAB, SECONDS, 1, place)  # made before the clock runs
-
-    async def staged():
-        async with site(broker):
-            return await scenario()
-
-    return asyncio.run(staged())
 
 
 @pytest.fixture
@@ -147,15 +138,12 @@ def replayed(path):
 
 
 @pytest.mark.statistical
-def test_a_recording_replays_and_ctrl_c_closes_it(broker, tmp_path):
+async def test_a_recording_replays_and_ctrl_c_closes_it(broker, tmp_path):
     recorder = Recorder(broker.address, tmp_path / "live.mcap", "--json")
-
-    async def scenario():
+    async with site(broker):
         await recorder.start()
         await recorder.grown(200_000)
-        return await recorder.end()
-
-    code, out, _ = run(scenario, broker)
+        code, out, _ = await recorder.end()
     assert code == 0
     told = json.loads(out)
     reports, summary = replayed(recorder.path)
@@ -172,19 +160,16 @@ def test_a_recording_replays_and_ctrl_c_closes_it(broker, tmp_path):
 
 @both
 @pytest.mark.statistical
-def test_a_broker_that_dies_and_returns_costs_no_reception_that_it_kept(broker, tmp_path):
+async def test_a_broker_that_dies_and_returns_costs_no_reception_that_it_kept(broker, tmp_path):
     recorder = Recorder(broker.address, tmp_path / "restart.mcap", "--site-id", str(LAB.id), "--json")
-
-    async def scenario():
+    async with site(broker):
         await recorder.start()
         await recorder.grown(150_000)
         await broker.kill()
         await asyncio.sleep(0.5)
         await broker.start()
         await recorder.grown(150_000)
-        return await recorder.end()
-
-    code, out, _ = run(scenario, broker)
+        code, out, _ = await recorder.end()
     assert code == 0
     reports, _ = replayed(recorder.path)
     gaps = json.loads(out)["drops"].get("gap-in-receptions", 0)
@@ -201,19 +186,16 @@ def test_a_broker_that_dies_and_returns_costs_no_reception_that_it_kept(broker, 
 
 @both
 @pytest.mark.statistical
-def test_a_killed_recorder_leaves_all_but_the_last_second_and_another_one_goes_on(broker, tmp_path):
+async def test_a_killed_recorder_leaves_all_but_the_last_second_and_another_one_goes_on(broker, tmp_path):
     first = Recorder(broker.address, tmp_path / "killed.mcap")
     second = Recorder(broker.address, tmp_path / "second.mcap", "--duration", "2", "--json")
-
-    async def scenario():
+    async with site(broker):
         await first.start()
         await first.grown(200_000)
         killed_s = time.time()
         await first.end(signal.SIGKILL)
         await second.start()
-        return killed_s, await second.end(None)
-
-    killed_s, (code, out, _) = run(scenario, broker)
+        code, out, _ = await second.end(None)
     reports, summary = replayed(first.path)
     assert not summary.finished
     assert killed_s - summary.end_s < 1.0
@@ -223,14 +205,11 @@ def test_a_killed_recorder_leaves_all_but_the_last_second_and_another_one_goes_o
 
 
 @pytest.mark.statistical
-def test_a_disk_that_takes_no_more_is_reported_once_and_leaves_a_whole_file(broker, tmp_path):
+async def test_a_disk_that_takes_no_more_is_reported_once_and_leaves_a_whole_file(broker, tmp_path):
     recorder = Recorder(broker.address, tmp_path / "full.mcap", limit_bytes=250_000)
-
-    async def scenario():
+    async with site(broker):
         await recorder.start()
-        return await recorder.end(None)
-
-    code, out, err = run(scenario, broker)
+        code, out, err = await recorder.end(None)
     assert code == 1
     assert err.count("cannot be written any more: File too large") == 1
     assert "not written at the end" in out

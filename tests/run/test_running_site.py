@@ -267,9 +267,9 @@ FAULTS = (
 )
 
 
-async def ride(folder):
-    """All faults one after the other, and what came of it."""
-    trial = Trial(folder)
+@pytest.mark.skipif(MOSQUITTO is None, reason="mosquitto is not installed")
+async def test_a_site_rides_through_the_death_and_the_freezing_of_every_process(tmp_path):
+    trial = Trial(tmp_path)
     helpers = []
     try:
         await trial.site.start()
@@ -287,7 +287,7 @@ async def ride(folder):
         for task in helpers:
             task.cancel()
         await asyncio.wait(helpers)
-        return trial, await trial.site.stop()
+        codes = await trial.site.stop()
     finally:
         _log.warning("%s", {name: round(value, 3) for name, value in trial.figures.items()})
         _log.warning("judged %d, not %d, load %s", trial.observer.judged, trial.observer.unjudged, os.getloadavg())
@@ -297,11 +297,6 @@ async def ride(folder):
             if program.process is not None and program.process.returncode is None:
                 await program.kill()
         await trial.site.broker.stop()
-
-
-@pytest.mark.skipif(MOSQUITTO is None, reason="mosquitto is not installed")
-def test_a_site_rides_through_the_death_and_the_freezing_of_every_process(tmp_path):
-    trial, codes = asyncio.run(ride(tmp_path))
     observer = trial.observer
     assert not observer.false, observer.false[:5]
     assert observer.judged > 4000

@@ -20,8 +20,8 @@ def apply(folder, capsys):
     return json.loads(capsys.readouterr().out)["tenants"]
 
 
-def test_a_site_publishes_its_own_and_no_tenant_sees_another(tmp_path, capsys):
-    async def run(hub):
+async def test_a_site_publishes_its_own_and_no_tenant_sees_another(tmp_path, capsys):
+    with running_hub(tmp_path) as (hub, _):
         async with site(tmp_path, hub.leaf("plant", 7)) as one, site(tmp_path, hub.leaf("other", 7)) as two:
             plant, other = await client_of(hub.address("plant")), await client_of(hub.address("other"))
             near, far = await client_of(one.nats), await client_of(two.nats)
@@ -59,9 +59,6 @@ def test_a_site_publishes_its_own_and_no_tenant_sees_another(tmp_path, capsys):
                 await plant.request("$JS.site7.API.STREAM.PURGE.STATE_7")
             for client in (plant, other, near, far):
                 await client.close()
-
-    with running_hub(tmp_path) as (hub, _):
-        asyncio.run(run(hub))
 
 
 @pytest.mark.statistical

@@ -1,6 +1,5 @@
 """Batches of a stream into a history: each once, with the names that come later, and what is missing is counted."""
 
-import asyncio
 from types import SimpleNamespace
 
 import numpy as np
@@ -49,46 +48,42 @@ def quick(monkeypatch):
     monkeypatch.setattr(program, "_PERIOD_S", 0.0)
 
 
-def take(writer, names, *messages):
+async def take(writer, names, *messages):
     taker = BatchTaker(names, writer, lambda _line: None)
-
-    async def all_of_them():
-        for one in messages:
-            await taker.take(one)
-
-    asyncio.run(all_of_them())
+    for one in messages:
+        await taker.take(one)
 
 
-def test_each_batch_is_taken_once_and_gaps_are_counted(writer):
+async def test_each_batch_is_taken_once_and_gaps_are_counted(writer):
     names = LateNames("a")
     again = message(3, 5, 2, 1)
-    take(writer, names, message(1, 5, 1, 1), message(2, 5, 2, 1), again, message(4, 5, 6, 1), message(9, 6, 3, 1))
+    await take(writer, names, message(1, 5, 1, 1), message(2, 5, 2, 1), again, message(4, 5, 6, 1), message(9, 6, 3, 1))
     assert writer.fixes.taken == 4
     assert writer.fixes.place.number == 9
     assert writer.drops["lost-batches"] == 3  # of run 5; where run 6 began is not known
-    take(writer, names, message(9, 6, 3, 1), message(10, 6, 4, 1))  # another start goes on after its place
+    await take(writer, names, message(9, 6, 3, 1), message(10, 6, 4, 1))  # another start goes on after its place
     assert writer.fixes.taken == 5
 
 
 @pytest.mark.usefixtures("quick")
-def test_a_batch_waits_for_its_names(writer):
+async def test_a_batch_waits_for_its_names(writer):
     names = LateNames("abc")
-    take(writer, names, message(1, 5, 1, 1, 3), message(2, 5, 2, 2))
+    await take(writer, names, message(1, 5, 1, 1, 3), message(2, 5, 2, 2))
     assert (names.readings, sorted(writer.names.rows), writer.drops["no-name"]) == (3, ["a", "b", "c"], 0)
 
 
 @pytest.mark.usefixtures("quick")
-def test_names_that_never_come_hold_a_history_up_once(writer, monkeypatch):
+async def test_names_that_never_come_hold_a_history_up_once(writer, monkeypatch):
     monkeypatch.setattr(program, "_NAMES_S", 0.05)
     names = LateNames("a")
-    take(writer, names, message(1, 5, 1, 1, 2, issue=2))
+    await take(writer, names, message(1, 5, 1, 1, 2, issue=2))
     readings = names.readings
-    take(writer, names, message(2, 5, 2, 1))
+    await take(writer, names, message(2, 5, 2, 1))
     assert (writer.fixes.taken, writer.drops["no-name"], names.readings) == (2, 1, readings)
 
 
 @pytest.mark.usefixtures("quick")
-def test_a_batch_waits_while_its_names_cannot_be_read(writer, monkeypatch):
+async def test_a_batch_waits_while_its_names_cannot_be_read(writer, monkeypatch):
     names, lines = LateNames("a"), []
     answers, read = iter([Error("timeout"), Error("timeout")]), names.read
 
@@ -98,13 +93,13 @@ def test_a_batch_waits_while_its_names_cannot_be_read(writer, monkeypatch):
         await read()
 
     monkeypatch.setattr(names, "read", fail_twice)
-    asyncio.run(BatchTaker(names, writer, lines.append).take(message(1, 5, 1, 1)))
+    await BatchTaker(names, writer, lines.append).take(message(1, 5, 1, 1))
     assert lines == ["the names of site 7 cannot be read: timeout"]
     assert (writer.fixes.taken, writer.drops["no-name"]) == (1, 0)
 
 
-def test_bytes_that_are_no_batch_are_counted(writer):
+async def test_bytes_that_are_no_batch_are_counted(writer):
     broken = message(1, 5, 1, 1)
     broken.data = b"SKB?"
-    take(writer, LateNames(""), broken)
+    await take(writer, LateNames(""), broken)
     assert writer.drops["wrong-batch"] == 1

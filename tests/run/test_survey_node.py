@@ -3,9 +3,7 @@
 import asyncio
 import json
 import math
-from errno import ENOSPC
 from functools import cache
-from pathlib import Path
 from types import SimpleNamespace
 
 import msgspec
@@ -30,6 +28,7 @@ from skyless.site.file.check import image_size
 from skyless.site.file.load import load_site
 from skyless.site.survey.facts import Facts, Gauge, PairRanges, Survey, SurveyedAnchor, Tape
 from skyless.site.survey.surveyed_site import FloorImage, is_record_of, read_record, record_path, save_survey
+from support.full_disk import full_disk
 from support.waiting import running
 
 pytestmark = pytest.mark.site
@@ -420,16 +419,7 @@ async def test_of_two_programs_at_one_site_the_later_one_waits_until_the_other_h
 @pytest.mark.parametrize("failing", [1, 2, 3, 4])
 def test_where_not_all_files_can_be_written_none_is(tmp_path, monkeypatch, failing, file):
     """The image of the floor, the site's file before, the survey's record, and the site's file."""
-    written = []
-    write_bytes = Path.write_bytes
-
-    def until_the_disk_is_full(path, data):
-        written.append(path)
-        if len(written) == failing:
-            raise OSError(ENOSPC, "No space left on device", str(path))
-        return write_bytes(path, data)
-
-    monkeypatch.setattr(Path, "write_bytes", until_the_disk_is_full)
+    written = full_disk(monkeypatch, failing)
     floor = FloorImage(FloorPlanSite("floor.png", 12.0, -1.0, -2.0), PNG)
     with pytest.raises(SkylessError, match="No space left"):
         save_survey(file, true_survey(), PairRanges((), tuple(POSITIONS_M)), 0.0, floor)

@@ -77,7 +77,7 @@ def test_a_tag_s_state_names_the_anchors_whose_phases_it_uses():
         bench.hear(heard)
         numbers = dict.fromkeys(("receptions", "cpu", "memory_bytes", "late_in_link"), 0)
         counted = bench.node.fix_log.health(
-            method="joint", reason=None, counters=Counter(), mqtt=Counters(0, 0, 0), phases=(), **numbers
+            method="joint", reason=None, counters=Counter(), mqtt=Counters(0, 0, 0), **numbers
         )
         told.append(bench.node.complete(counted).carrier_phase_anchors)
     assert told == [(), tuple(sorted(anchor.id for anchor in LAB.anchors))]

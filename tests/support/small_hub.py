@@ -21,7 +21,7 @@ def running_hub(folder, fixes_gb=0.1):
         node = ("--node", f"127.0.0.1:{port}", "--data", str(folder / "data"), "--fixes-gb", str(fixes_gb))
         assert main(["hub", "init", str(folder / "hub"), *node, *words]) == 0
     with started(_program(), "-c", folder / "hub" / f"127.0.0.1-{port}" / "nats-server.conf", limit_s=300) as server:
-        yield read_json(folder / "hub" / "hub.json", Hub, ""), server
+        yield read_json(folder / "hub" / "hub.json", Hub), server
 
 
 async def client_of(address):

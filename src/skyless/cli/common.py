@@ -202,6 +202,9 @@ class JsonOptions(Options, frozen=True, kw_only=True):
     """Write one JSON object instead of text."""
 
 
+RecordingFile = Annotated[Path, Parameter(help="The recording, an MCAP file of skyless record.")]
+
+
 def command(run: Callable[..., int | None]) -> Callable[..., int | None]:
     """Adapt a function to cyclopts: the fields of each parameter that is a struct of options become options.
 

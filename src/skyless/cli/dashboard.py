@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import App, Parameter
 
-from skyless.cli.common import command, print_json
+from skyless.arguments import Options
+from skyless.cli.common import JsonOptions, command, print_json
 from skyless.cli.nodes.options import HubUrl, MqttOptions, SiteId, hub_address, listen_address, site_named
 from skyless.core.errors import SkylessError
 from skyless.machine import extra_module
@@ -16,7 +17,7 @@ from skyless.machine import extra_module
 if TYPE_CHECKING:
     from collections.abc import Coroutine
 
-    from skyless.page.app import ListenAddress, Services
+    from skyless.page.app import Services
     from skyless.page.connections import AccessRules
     from skyless.page.gathered import Gathered
     from skyless.page.live import LiveSite
@@ -31,88 +32,74 @@ _SHORTEST_TOKEN = 12
 app = App(name="dashboard", help_epilogue="Example: skyless dashboard --mqtt mqtt://127.0.0.1:1883")
 
 
+class DashboardOptions(Options, frozen=True, kw_only=True):
+    """Options of ``skyless dashboard``."""
+
+    site: str | None = None
+    """Site file, or lab; by default the one that the broker has retained, which comes before this."""
+    site_id: SiteId | None = None
+    """Number of the site; by default one whose programs are online, and the page lets choose among several."""
+    listen: str = "127.0.0.1"
+    """Where programs connect, here browsers, HOST:PORT or HOST; without PORT 8080, or the next port that is free."""
+    recordings: Path | None = None
+    """Folder of recordings to replay."""
+    history: Path | None = None
+    """Folder of the history that skyless history writes, for questions about the past."""
+    assets: Path | None = None
+    """CSV file of what the tags are attached to: given to the broker where it has none, and written with each change.
+    It is of the first site that is shown."""
+    token: Annotated[str | None, Parameter(env_var="SKYLESS_DASHBOARD_TOKEN")] = None
+    """Token that browsers must give; made and printed where other machines can reach the page and none is given."""
+    nats: Annotated[str | None, Parameter(env_var="SKYLESS_NATS")] = None
+    """NATS server of a site with a gather, nats://[USER@]HOST[:PORT] or tls://...; by default that of the broker, if it
+    runs on this machine with --gather."""
+    reader_token: Annotated[str | None, Parameter(env_var="SKYLESS_DASHBOARD_READER_TOKEN")] = None
+    """Another token for who may only look on; where it is given, changes need the other one on this machine, too."""
+    hub: HubUrl = None
+    """Hub whose sites are shown, nats://[USER@]HOST[:PORT],HOST... or tls://...; nothing is changed from there."""
+
+
 @app.default
 @command
-def dashboard(
-    *,
-    broker: MqttOptions,
-    site: str | None = None,
-    site_id: SiteId | None = None,
-    listen: str | None = None,
-    recordings: Path | None = None,
-    history: Path | None = None,
-    assets: Path | None = None,
-    token: Annotated[str | None, Parameter(env_var="SKYLESS_DASHBOARD_TOKEN")] = None,
-    nats: Annotated[str | None, Parameter(env_var="SKYLESS_NATS")] = None,
-    reader_token: Annotated[str | None, Parameter(env_var="SKYLESS_DASHBOARD_READER_TOKEN")] = None,
-    hub: HubUrl = None,
-    json: bool = False,
-) -> None:
+def dashboard(*, asked: DashboardOptions, broker: MqttOptions, output: JsonOptions) -> None:
     """Show a site live in the browser, or the sites at a hub; Ctrl-C stops.
 
     Anyone who opens the page may draw zones. On this machine only, it asks for no token; to other machines it serves
     plain HTTP, so use it in networks that you trust or behind a proxy with TLS.
-
-    Parameters
-    ----------
-    site
-        Site file, or lab; by default the one that the broker has retained, which comes before this.
-    site_id
-        Number of the site; by default one whose programs are online, and the page lets choose among several.
-    listen
-        Where programs connect, here browsers, HOST:PORT; by default 127.0.0.1:8080, or the next free port.
-    recordings
-        Folder of recordings to replay.
-    history
-        Folder of the history that skyless history writes, for questions about the past.
-    assets
-        CSV file of what the tags are attached to: given to the broker where it has none, and written with each change.
-        It is of the first site that is shown.
-    token
-        Token that browsers must give; made and printed where other machines can reach the page and none is given.
-    nats
-        NATS server of a site with a gather, nats://[USER@]HOST[:PORT] or tls://...; by default that of the broker, if
-        it runs on this machine with --gather.
-    reader_token
-        Another token for who may only look on; where it is given, changes need the other one on this machine, too.
-    hub
-        Hub whose sites are shown, nats://[USER@]HOST[:PORT],HOST... or tls://...; nothing is changed from there.
-    json
-        Write one JSON object with the page's address instead of a table.
     """
     import asyncio
     import re
     import socket
 
     from skyless.page.api.questions import Past
-    from skyless.page.app import Services, bind, serve
+    from skyless.page.app import PORT, Services, bind, serve
     from skyless.page.live import LiveSite
     from skyless.page.playback import Playback
     from skyless.run.condition.evidence import ProcessorUse
 
+    recordings, history, hub = asked.recordings, asked.history, asked.hub
     if recordings is not None and not recordings.is_dir():
         raise SkylessError(f"--recordings is {str(recordings)!r}; it should be a folder")
     if history is not None:
         if not history.is_dir():
             raise SkylessError(f"--history is {str(history)!r}; it should be a folder that skyless history writes")
         extra_module("duckdb", "--history")
-    listening = _listening(listen)
-    sock = bind(listening)
-    port = sock.getsockname()[1]
-    rules = _rules(sock.getsockname()[0], listening.host, port, token, reader_token, read_only=hub is not None)
+    host, port_asked = listen_address(asked.listen, PORT)
+    sock = bind(host, port_asked)
+    bound, port = sock.getsockname()[:2]
+    rules = _rules(bound, host, port, asked.token, asked.reader_token, read_only=hub is not None)
     # The same name on MQTT after a restart, so that old sessions do not accumulate.
     client = f"{re.sub(r'[^A-Za-z0-9_.-]', '-', socket.gethostname())}-{port}"
     make = partial(LiveSite, client, used_share=ProcessorUse().share, has_history=history is not None)
     serves = partial(Services, playback=Playback(recordings), past=Past(history))
     if hub is None:
-        address, services, work = _at_broker(make, serves, broker, site, site_id, assets, nats)
+        address, services, work = _at_broker(make, serves, broker, asked)
     else:
-        given = {"--mqtt": broker.mqtt, "--nats": nats, "--assets": assets, "--site": site, "--site-id": site_id}
-        for option in (option for option, value in given.items() if value is not None):
-            raise SkylessError(f"--hub and {option} exclude each other; give one of them")
+        for name in (*broker.given("mqtt"), *asked.given("nats", "assets", "site", "site_id")):
+            raise SkylessError(f"--hub and --{name.replace('_', '-')} exclude each other; give one of them")
         address, services, work = _at_hub(make, serves, hub, broker.mqtt_ca)
-    page = _address(listening.host, port, rules)
-    if json:
+    page = _address(host, port, rules)
+    if output.json:
         kind = "mqtt" if hub is None else "hub"
         print_json({"page": page, kind: address, "token": rules.token, "reader_token": rules.reader_token})
         sys.stdout.flush()
@@ -123,19 +110,14 @@ def dashboard(
 
 
 def _at_broker(
-    make: "partial[LiveSite]",
-    serves: "partial[Services]",
-    broker: MqttOptions,
-    site: str | None,
-    site_id: int | None,
-    assets: Path | None,
-    nats: str | None,
+    make: "partial[LiveSite]", serves: "partial[Services]", broker: MqttOptions, asked: DashboardOptions
 ) -> "_Served":
     """Services for the sites of a broker. Raises SkylessError."""
     from skyless.page.site_assets import AssetsFile
     from skyless.page.sites import LiveSites
 
     address = broker.required("the broker of the site to show")
+    site, site_id, assets = asked.site, asked.site_id, asked.assets
     known, images = (None, {}) if site is None else _load(site)
     if known is not None and site_id is not None and known.site.id != site_id:
         raise SkylessError(f"--site-id is {site_id}, but {site} is of site {known.site.id}; give one of them")
@@ -143,7 +125,7 @@ def _at_broker(
     live = make(site=known, assets_file=None if assets is None else AssetsFile(assets))
     live.plans.update(images)
     sites = LiveSites(live, make)
-    services = serves(sites=sites, gathered=_gathered(nats, address))
+    services = serves(sites=sites, gathered=_gathered(asked.nats, address))
     return str(address), services, sites.run(address, known.site.id if known is not None else site_id)
 
 
@@ -181,15 +163,6 @@ def _load(name: str) -> "tuple[SiteMessage, dict[int | None, bytes]]":
     site = site_named(name)
     images = {floor: file.read_bytes() for floor, file in plan_files(site, Path(name)).items()}
     return site_message(site, simulated=False, unix_s=time.time()), images
-
-
-def _listening(listen: str | None) -> "ListenAddress":
-    """The address to listen at. Raises SkylessError."""
-    from skyless.page.app import PORT, ListenAddress
-
-    if listen is None:
-        return ListenAddress("127.0.0.1", None)
-    return ListenAddress(*listen_address(listen, PORT))
 
 
 def _rules(

@@ -1,13 +1,10 @@
 """``skyless history``: keep a site's fixes and events in Parquet files, and query them."""
 
-import asyncio
-import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
-from datetime import datetime
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Final
+from typing import TYPE_CHECKING, Annotated, Any
 
 from cyclopts import App, Parameter
 from msgspec import Struct
@@ -16,6 +13,8 @@ from msgspec.structs import asdict
 from skyless.arguments import Option, Options, Positive, whole
 from skyless.cli.common import (
     NO_FIX,
+    JsonOptions,
+    RecordingFile,
     check_folder,
     check_new,
     check_picture,
@@ -23,11 +22,13 @@ from skyless.cli.common import (
     console,
     make_folder,
     print_json,
+    with_status,
     write_picture,
 )
-from skyless.cli.nodes.options import MqttOptions, SiteId, log, run_until_stopped
+from skyless.cli.nodes.options import SiteId, SiteOptions, log, run_until_stopped
 from skyless.core.errors import SkylessError
 from skyless.machine import extra_module
+from skyless.run.history.answers import span_of, time_text
 
 if TYPE_CHECKING:
     from collections.abc import Awaitable
@@ -52,11 +53,17 @@ _LONGEST_LIST = 10
 _HEADINGS = {"seconds": "duration"}
 _OF_TAGS = ("tag", "other")
 _Row = dict[str, Any]
+_Tag = Annotated[str, Parameter(help="Name of the tag, or of its asset.")]
+_Tags = Annotated[str, Parameter(help="Names of tags, or of their assets.")]
+_Points = Annotated[int, whole(2, 20_000), Parameter(help="How many points of the way are given at most.")]
+_Cell = Annotated[Positive, Parameter(help="Side of a cell in metres.")]
+_Zone = Annotated[str | None, Parameter(help="Identifier of the only zone; by default all.")]
+_Within = Annotated[Positive, Parameter(help="Metres in the plane at which tags are near each other.")]
 
 questions = App(name="history")
 
 
-class _Asked(Options, frozen=True, kw_only=True):
+class _Asked(JsonOptions, frozen=True, kw_only=True):
     begin: Annotated[str, Option("from")] = "today"
     """When the range begins: 14:00, yesterday 8:00, 2 hours ago, an ISO time, or seconds since 1970."""
     end: Annotated[str | None, Option("to")] = None
@@ -65,13 +72,11 @@ class _Asked(Options, frozen=True, kw_only=True):
     """Folder of the history; by default history in the user's data folder."""
     site_id: SiteId | None = None
     """Number of the site; by default the only one in the folder."""
-    json: bool = False
-    """Write one JSON object instead of the table."""
 
     def opened(self) -> "tuple[History, Span]":
         """Open the history, and parse the time range. Raises SkylessError."""
-        from skyless.run.history.answers import span_of
-        from skyless.run.history.queries import History, sites_in
+        from skyless.run.history.layout import sites_in
+        from skyless.run.history.queries import History
         from skyless.run.process import data_folder
 
         folder = self.history or data_folder() / "history"
@@ -126,7 +131,7 @@ def _named(answer: Struct, assets: Mapping[str, str]) -> _Row:
 def _track_rows(way: _Row) -> list[_Row]:
     row = {name: way[name] for name in ("tag_name", "fixes", "length_m")}
     for end, point in zip(("first", "last"), (*way["points"][:1], *way["points"][-1:]), strict=False):
-        row[end] = f"({point.x_m:.2f}, {point.y_m:.2f}) m at {_time(point.unix_s)}"
+        row[end] = f"({point.x_m:.2f}, {point.y_m:.2f}) m at {time_text(point.unix_s)}"
     return [row] if way["fixes"] else []
 
 
@@ -147,61 +152,29 @@ _ROWS: Mapping[str, Callable[[Any], list[_Row]]] = {"track": _track_rows, "heatm
 
 @questions.command(help_epilogue="Example: skyless history track tag7 --from 8:00 --to 16:00 --plot way.png")
 @command
-def track(tag: str, /, *, asked: _Drawn, points: Annotated[int, whole(2, 20_000)] = 2000) -> int:
-    """Where a tag was: its way, thinned to a number of points, with its length.
-
-    Parameters
-    ----------
-    tag
-        Name of the tag, or of its asset.
-    points
-        How many points of the way are given at most.
-    """
+def track(tag: _Tag, /, *, asked: _Drawn, points: _Points = 2000) -> int:
+    """Where a tag was: its way, thinned to a number of points, with its length."""
     return asked.answer("track", lambda history, span: history.track(tag, span, points))
 
 
 @questions.command(help_epilogue="Example: skyless history heatmap --from yesterday --to today --plot heat.png")
 @command
-def heatmap(*tags: str, asked: _Drawn, cell: Positive = 0.25) -> int:
-    """How long tags, by default all, were where.
-
-    Parameters
-    ----------
-    tags
-        Names of tags, or of their assets.
-    cell
-        Side of a cell in metres.
-    """
+def heatmap(*tags: _Tags, asked: _Drawn, cell: _Cell = 0.25) -> int:
+    """How long tags, by default all, were where."""
     return asked.answer("heatmap", lambda history, span: history.heatmap(span, cell, tags))
 
 
 @questions.command(help_epilogue="Example: skyless history dwell --from monday --zone dock")
 @command
-def dwell(*tags: str, asked: _Drawn, zone: str | None = None) -> int:
-    """How long tags, by default all, were in zones.
-
-    Parameters
-    ----------
-    tags
-        Names of tags, or of their assets.
-    zone
-        Identifier of the only zone; by default all.
-    """
+def dwell(*tags: _Tags, asked: _Drawn, zone: _Zone = None) -> int:
+    """How long tags, by default all, were in zones."""
     return asked.answer("dwell", lambda history, span: history.dwell(span, tags, zone))
 
 
 @questions.command(help_epilogue="Example: skyless history contacts tag7 --from yesterday --within 1.5")
 @command
-def contacts(tag: str, /, *, asked: _Drawn, within: Positive = 2.0) -> int:
-    """Which tags were near a tag, and when.
-
-    Parameters
-    ----------
-    tag
-        Name of the tag, or of its asset.
-    within
-        Metres in the plane at which tags are near each other.
-    """
+def contacts(tag: _Tag, /, *, asked: _Drawn, within: _Within = 2.0) -> int:
+    """Which tags were near a tag, and when."""
     return asked.answer("contacts", lambda history, span: history.contacts(tag, span, within))
 
 
@@ -267,7 +240,7 @@ def _shown(name: str, value: object) -> str:
     if not isinstance(value, float):
         return str(value)
     if name.endswith("unix_s"):
-        return _time(value)
+        return time_text(value)
     if name != "seconds":
         return f"{value:.2f}"
     minutes, seconds = divmod(round(value), 60)
@@ -275,80 +248,66 @@ def _shown(name: str, value: object) -> str:
     return f"{hours} h {minutes:02} min" if hours else f"{minutes} min {seconds:02} s" if minutes else f"{seconds} s"
 
 
-def _time(unix_s: float) -> str:
-    return datetime.fromtimestamp(unix_s).isoformat(" ", "seconds")
-
-
 def _range(span: "Span") -> str:
-    return f"{_time(span.from_unix_s)} to {_time(span.to_unix_s)}"
+    return f"{time_text(span.from_unix_s)} to {time_text(span.to_unix_s)}"
 
 
-_STATUS_S: Final = 0.5
-
-HistoryFolder = Annotated[Path, Parameter(name="--to")]
+HistoryFolder = Annotated[
+    Path, Parameter(name="--to", help="Where fixes are kept: a folder, which several sites may share.")
+]
 
 app = App(name="history", help_epilogue="Example: skyless history run --to history")
 app.update(questions)
 
 
+class RunOptions(Options, frozen=True, kw_only=True):
+    """Options of ``skyless history run``."""
+
+    nats: Annotated[str | None, Parameter(env_var="SKYLESS_NATS")] = None
+    """NATS server of the site, nats://[USER@]HOST[:PORT] or tls://...; by default that of a broker with a gather on
+    this machine, or else one of its own."""
+    hub: Annotated[str | None, Option("from")] = None
+    """Servers of a hub, nats://[USER@]HOST[:PORT],HOST... or tls://...: all its sites are kept, or that of
+    --site-id."""
+    keep_days: Positive = 400.0
+    """Days after which fixes are removed."""
+    full_days: Positive = 7.0
+    """Days after which fixes are thinned: of a moving tag one in ten seconds stays, of a tag at rest one in a
+    minute."""
+    event_days: Positive = 365.0
+    """Days after which events are removed: entered and left zones, alarms, anchors and tags that came and went."""
+
+
 @app.command(help_epilogue="Example: skyless history run --to history --keep-days 90")
 @command
-def run(
-    *,
-    to: HistoryFolder,
-    broker: MqttOptions,
-    nats: Annotated[str | None, Parameter(env_var="SKYLESS_NATS")] = None,
-    from_: Annotated[str | None, Parameter(name="--from")] = None,
-    site_id: SiteId | None = None,
-    keep_days: Positive = 400.0,
-    full_days: Positive = 7.0,
-    event_days: Positive = 365.0,
-    json: bool = False,
-) -> int:
+def run(*, to: HistoryFolder, live: SiteOptions, asked: RunOptions, output: JsonOptions) -> int:
     """Keep the fixes and events of a running site, or of a hub's, until Ctrl-C, in Parquet files for any tool.
 
     A kill -9 loses nothing that has reached the site's stream. Give the same folder at every start. The exit code is 1
     where the disk did not take everything; the next start goes on there.
-
-    Parameters
-    ----------
-    to
-        Where fixes are kept: a folder, which several sites may share.
-    nats
-        NATS server of the site, nats://[USER@]HOST[:PORT] or tls://...; by default that of a broker with a gather on
-        this machine, or else one of its own.
-    from_
-        Servers of a hub, nats://[USER@]HOST[:PORT],HOST... or tls://...: all its sites are kept, or that of --site-id.
-    site_id
-        Number of the site; by default the one whose programs are online.
-    keep_days
-        Days after which fixes are removed.
-    full_days
-        Days after which fixes are thinned: of a moving tag one in ten seconds stays, of a tag at rest one in a minute.
-    event_days
-        Days after which events are removed: entered and left zones, alarms, anchors and tags that came and went.
-    json
-        Write one JSON object at the end instead of text.
     """
     from skyless.run.gather.subjects import nats_address
     from skyless.run.history.writer import Keep
 
     extra_module("nats", "skyless history run")
-    keep = Keep(keep_days, full_days, event_days)
+    keep = Keep(asked.keep_days, asked.full_days, asked.event_days)
     found: list[_History] = []
-    if from_ is not None:
-        if broker.mqtt is not None or nats is not None:
-            raise SkylessError(f"--from is {from_!r}; give it without --mqtt and --nats, which are of a single site")
-        hub = nats_address(from_, "--from", broker.mqtt_ca)
+    if asked.hub is not None:
+        if live.mqtt is not None or asked.nats is not None:
+            raise SkylessError(
+                f"--from is {asked.hub!r}; give it without --mqtt and --nats, which are of a single site"
+            )
+        hub = nats_address(asked.hub, "--from", live.mqtt_ca)
         hub.tls_context()
-        opening = partial(_of_hub, to, hub, site_id, keep)
+        opening = partial(_of_hub, to, hub, live.site_id, keep)
     else:
-        address = broker.required("the broker of the site whose history to keep")
-        opening = partial(_of_broker, to, address, site_id, keep, None if nats is None else nats_address(nats))
+        address = live.required("the broker of the site whose history to keep")
+        nats = None if asked.nats is None else nats_address(asked.nats)
+        opening = partial(_of_broker, to, address, live.site_id, keep, nats)
     make_folder("--to", to)
     run_until_stopped(_keep(opening, found))
     state = found[0].state() if found else None
-    if json:
+    if output.json:
         import msgspec
 
         print_json({"folder": to, **({} if state is None else msgspec.to_builtins(state))})
@@ -383,23 +342,12 @@ async def _keep(opening: "Callable[[], Awaitable[_History]]", found: "list[_Hist
     """Run a history until cancelled, and append it to ``found``."""
     node = await opening()
     found.append(node)
-    screen = asyncio.ensure_future(_status(node)) if sys.stderr.isatty() else None
-    try:
-        await node.run()
-    finally:
-        if screen is not None:
-            screen.cancel()
-            print(file=sys.stderr)
+    await with_status(node.run(), lambda: _line(node.state()))
 
 
-async def _status(node: "_History") -> None:
-    """Keep a status line on the terminal up to date."""
-    while True:
-        await asyncio.sleep(_STATUS_S)
-        now = node.state()
-        trouble = now.disk or (f"no broker, {now.trouble}" if now.trouble else "Ctrl-C ends")
-        line = f"history, {now.seconds:.0f} s: {_counts(now)}, {now.waiting} in no file yet{_losses(now)}; {trouble}"
-        print(f"\r\x1b[2K{line}", end="", file=sys.stderr, flush=True)
+def _line(now: "HistoryState") -> str:
+    trouble = now.disk or (f"no broker, {now.trouble}" if now.trouble else "Ctrl-C ends")
+    return f"history, {now.seconds:.0f} s: {_counts(now)}, {now.waiting} in no file yet{_losses(now)}; {trouble}"
 
 
 def _counts(state: "HistoryState") -> str:
@@ -411,22 +359,15 @@ def _losses(state: "HistoryState") -> str:
     return f"; not kept: {', '.join(lost)}" if lost else ""
 
 
+_RecordedSite = Annotated[SiteId | None, Parameter(help="Number of the site; by default the one that was recorded.")]
+
+
 @app.command(name="import", help_epilogue="Example: skyless history import walk.mcap --to history")
 @command
-def import_file(recording: Path, /, *, to: HistoryFolder, site_id: SiteId | None = None, json: bool = False) -> None:
-    """Add the fixes, events, zones and names of a recording to a history; what that has already is left out.
-
-    Parameters
-    ----------
-    recording
-        The recording, an MCAP file of skyless record.
-    to
-        Where fixes are kept: a folder, which several sites may share.
-    site_id
-        Number of the site; by default the one that was recorded.
-    json
-        Write one JSON object instead of text.
-    """
+def import_file(
+    recording: RecordingFile, /, *, to: HistoryFolder, site_id: _RecordedSite = None, output: JsonOptions
+) -> None:
+    """Add the fixes, events, zones and names of a recording to a history; what that has already is left out."""
     import msgspec
 
     from skyless.cli.common import progress_bar
@@ -446,7 +387,7 @@ def import_file(recording: Path, /, *, to: HistoryFolder, site_id: SiteId | None
                 found = import_recording(source, writer, lambda unix_s: reach(unix_s - begin_s))
             finally:
                 writer.close()
-    if json:
+    if output.json:
         print_json({"folder": to, "site": site, **msgspec.to_builtins(found)})
         return
     print(f"{to}: {found.fixes} fixes and {found.events} events of site {site}; {found.known_fixes} fixes were there")

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Annotated, Any, Final, Literal
 
 import numpy as np
-from cyclopts import App
+from cyclopts import App, Parameter
 from msgspec.structs import replace
 
 from skyless.arguments import number, numbers, read_height, whole
@@ -148,15 +148,10 @@ def _check_free(file: Path, *, force: bool) -> None:
 
 @app.command(help_epilogue="Example: skyless site check site.toml --json")
 @command
-def check(file: Path, /, *, output: JsonOptions) -> None:
+def check(file: Annotated[Path, Parameter(help="The site file.")], /, *, output: JsonOptions) -> None:
     """Check a site file, and show what it makes: anchors, slots, rates, and what may cost accuracy.
 
     A mistake ends with exit code 2 and a message that names the key and what it should be; warnings do not.
-
-    Parameters
-    ----------
-    file
-        The site file.
     """
     report = _report(load_site(file))
     if output.json:

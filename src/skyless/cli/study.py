@@ -21,6 +21,7 @@ from skyless.cli.common import (
     command,
     console,
     json_form,
+    make_folder,
     print_json,
     print_table,
     progress_bar,
@@ -37,50 +38,45 @@ if TYPE_CHECKING:
     from skyless.research.studies.runner import Row
     from skyless.run.masterless.smoothing import OwnEstimator
 
-_OF_EFFICIENCY: Final = (
-    "Simulated. ± standard errors. NEES: per dimension, with the interval where 99 % of honest ones lie.",
-)
-_OF_LEVELS: Final = (
-    "Simulated. Level: share of fixes with a protection level. HPL, VPL: its median. Misleading, vertical: share of",
-    "fixes whose error exceeds it, in 10⁻⁴, with the interval where it truly lies with 99 %; held unless the risk lies",
-    "below that. Ratio: how many times smaller levels could be on clean data.",
-)
-_OF_THE_ROOM: Final = (
-    "Simulated. ± standard errors. NEES: per dimension. Fixes: superframes with one.",
-    "Level: share of fixes with a protection level. HPL: its median. Exceeded: share of those whose error is larger,",
-    "in 10⁻⁴, with the interval where it truly lies with 99 % (tags as units); unwarned: those without an alert.",
-    "CPU: of a tag for a message, measured.",
-)
-_OF_A_LARGE_SITE: Final = (
-    "Simulated; every fix counts. ± standard errors. NEES: per dimension. First fix: from a tag's first beacon on,",
-    "knowing nothing; 95 % of them are faster. Gap: the longest time between two fixes.",
-)
-_OF_SURVEYS: Final = (
-    "Simulated air. RMSE, bound: of anchors after the best rigid alignment. Delays: less their mean. Tag: what its",
-    "position is off by the survey alone; by hand: by positions good to 2 cm per axis and unknown delays. < 10 cm:",
-    "share of runs. Flagged: not determined, ambiguous or not checked. Wrong: 10 cm and four of their own sigmas off.",
-)
-_OF_SURVEYED_ROOMS: Final = (
-    "Simulated air. Site files by those who know the truth, by a survey, and by hand; the same tags with each.",
-    "Ratio: RMSE over that with the truth. NEES: per dimension. Level: share of fixes with a protection level.",
-    "HPL: its median. Exceeded: share of those whose error is larger, in 10⁻⁴, with the interval where it lies, 99 %.",
-)
-_OF_THE_WATCH: Final = (
-    "Simulated: drawn ranges, with drift of 2 cm. Found: events found within 30 s (moved slowly: within its time; fast",
-    "windows: 0.15 s); 99 %: time from the event. Named: of these, with the right anchors or links and no others;",
-    "kind: and what has happened to them. Wrong: an anchor said to have moved, or its delay to have changed, that",
-    "has not. Alarms: findings while nothing happens.",
-)
 _LEGENDS: Final = {
-    "efficiency": _OF_EFFICIENCY,
-    "integrity": _OF_LEVELS,
-    "room": _OF_THE_ROOM,
-    "large": _OF_A_LARGE_SITE,
-    "survey": _OF_SURVEYS,
-    "survey-room": _OF_SURVEYED_ROOMS,
-    "watch": _OF_THE_WATCH,
+    "efficiency": (
+        "Simulated. ± standard errors. NEES: per dimension, with the interval where 99 % of honest ones lie."
+    ),
+    "integrity": (
+        "Simulated. Level: share of fixes with a protection level. HPL, VPL: its median. Misleading, vertical: share "
+        "of fixes whose error exceeds it, in 10⁻⁴, with the interval where it truly lies with 99 %; held unless the "
+        "risk lies below that. Ratio: how many times smaller levels could be on clean data."
+    ),
+    "room": (
+        "Simulated. ± standard errors. NEES: per dimension. Fixes: superframes with one. Level: share of fixes with a "
+        "protection level. HPL: its median. Exceeded: share of those whose error is larger, in 10⁻⁴, with the interval "
+        "where it truly lies with 99 % (tags as units); unwarned: those without an alert. CPU: of a tag for a message, "
+        "measured."
+    ),
+    "large": (
+        "Simulated; every fix counts. ± standard errors. NEES: per dimension. First fix: from a tag's first beacon on, "
+        "knowing nothing; 95 % of them are faster. Gap: the longest time between two fixes."
+    ),
+    "survey": (
+        "Simulated air. RMSE, bound: of anchors after the best rigid alignment. Delays: less their mean. Tag: what its "
+        "position is off by the survey alone; by hand: by positions good to 2 cm per axis and unknown delays. < 10 cm: "
+        "share of runs. Flagged: not determined, ambiguous or not checked. "
+        "Wrong: 10 cm and four of their own sigmas off."
+    ),
+    "survey-room": (
+        "Simulated air. Site files by those who know the truth, by a survey, and by hand; the same tags with each. "
+        "Ratio: RMSE over that with the truth. NEES: per dimension. Level: share of fixes with a protection level. "
+        "HPL: its median. "
+        "Exceeded: share of those whose error is larger, in 10⁻⁴, with the interval where it lies, 99 %."
+    ),
+    "watch": (
+        "Simulated: drawn ranges, with drift of 2 cm. Found: events found within 30 s (moved slowly: within its time; "
+        "fast windows: 0.15 s); 99 %: time from the event. Named: of these, with the right anchors or links and no "
+        "others; kind: and what has happened to them. Wrong: an anchor said to have moved, or its delay to have "
+        "changed, that has not. Alarms: findings while nothing happens."
+    ),
 }
-
+"""What the columns of a study's table mean."""
 
 app = App(name="study", help_epilogue="Example: skyless study room --conditions loss --plot loss.png")
 
@@ -156,7 +152,7 @@ def print_rows(result: "StudyResult") -> None:
     caption = "RMSE, 95 %, max and σ: 2-D where the tags' height is given, else 3-D" if "95 %" in heads else ""
     rows = ([line[column] for column in used] for line in cells)
     print_table(result.title(), heads, rows, figures=True, caption=caption)
-    console().print(" ".join(_LEGENDS[result.name]))
+    console().print(_LEGENDS[result.name])
 
 
 def _limit(row: "Row") -> str:
@@ -358,10 +354,7 @@ def benchmark(folder: Path, /, *, asked: BenchmarkOptions, output: JsonOptions) 
     if not found:
         raise SkylessError(f"FOLDER is {str(folder)!r}; it should hold recordings that skyless replay can read")
     kept = asked.out / "results"
-    try:
-        kept.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise SkylessError(f"--out is {str(asked.out)!r}; it should be a folder: {error.strerror}") from None
+    make_folder("--out", kept)
     first_s = _QUICK_S if asked.quick and asked.first_s is None else asked.first_s
     own = asked.estimator
     estimators = {} if own is None else {getattr(own, "__name__", "own"): own}

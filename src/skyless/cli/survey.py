@@ -132,7 +132,7 @@ def survey(*, asked: SurveyOptions, live: LiveOptions, output: Output) -> int:
     heights = asked.anchor_height_m.values() if isinstance(asked.anchor_height_m, dict) else ()
     output.check_files(asked.site, asked.recording, *heights)
     if live.serve:
-        _serve_live(live, asked)
+        run_until_stopped(_serve(live, asked))
         return 0
     from skyless.cli.api.survey import Gathered, gathered, surveyed
 
@@ -287,14 +287,10 @@ def _gather_live(asked: LiveOptions, known: SurveyOptions) -> "tuple[Site, Calla
     return live.site, found[0].final_ranges, live.finish()
 
 
-def _serve_live(asked: LiveOptions, known: SurveyOptions) -> None:
-    """Run as the survey program of a site until Ctrl-C. Raises SkylessError."""
-
-    async def serve() -> None:
-        node = await _node(asked, known, serves=True)
-        await with_status(node.run(), lambda: _line(node, None))
-
-    run_until_stopped(serve())
+async def _serve(asked: LiveOptions, known: SurveyOptions) -> None:
+    """Run as the survey program of a site until cancelled. Raises SkylessError."""
+    node = await _node(asked, known, serves=True)
+    await with_status(node.run(), lambda: _line(node, None))
 
 
 async def _gather(asked: LiveOptions, known: SurveyOptions, found: "list[SurveyNode]") -> None:

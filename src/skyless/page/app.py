@@ -358,29 +358,21 @@ _GRACE_S: Final = 0.4
 _SEND_BUFFER_BYTES: Final = 262_144  # data for a slow page that waits in the kernel and is sent before anything newer
 
 
-class ListenAddress(Struct, frozen=True):
-    """Address at which the server listens."""
-
-    host: str
-    port: int | None
-    """None: 8080, or the next free port."""
-
-
-def bind(listen: ListenAddress) -> socket.socket:
-    """Open a socket at the address, or at the next free port if none is given.
+def bind(host: str, port: int | None) -> socket.socket:
+    """Open a socket at the address; without a port at 8080, or the next free one.
 
     Raises:
         SkylessError: the socket cannot listen there.
     """
-    if listen.port is not None:
-        return _bind(listen.host, listen.port)
-    for port in range(PORT, PORT + _MORE_PORTS):
-        held = reserve(listen.host, port)
+    if port is not None:
+        return _bind(host, port)
+    for number in range(PORT, PORT + _MORE_PORTS):
+        held = reserve(host, number)
         if held is None:  # reserved by a demo that is starting
             continue
         with held, contextlib.suppress(_PortInUseError):
-            return _bind(listen.host, port)
-    return _bind(listen.host, 0)
+            return _bind(host, number)
+    return _bind(host, 0)
 
 
 class _PortInUseError(SkylessError):
@@ -459,11 +451,8 @@ def _stop(server: "_Server", services: Services) -> None:
         server.should_exit = True
         for live in services.sites.all:
             live.close()
-        services.playback.stop()
-        services.overlays.stop()
-        services.what_ifs.stop()
-        services.sheets.stop()
-        services.past.stop()
+        for part in (services.playback, services.overlays, services.what_ifs, services.sheets, services.past):
+            part.stop()
         asyncio.get_running_loop().call_later(_GRACE_S, server.drop_connections)
 
 

@@ -282,7 +282,7 @@ class Gathered:
                 self._say(f"the names of site {site} cannot be read: {error or type(error).__name__}")
             for record, at_s in zip(FIELDS.iter_unpack(records.tobytes()), arrived_s.tolist(), strict=True):
                 if name := names.get(record[0]):
-                    live.on_batched_fix(fix_of(name, record), at_s)
+                    live.add_fix(fix_of(name, record), at_s, batched=True)
             # Sleep at least as long as the work took, so that batches are read in time.
             await asyncio.sleep(max(_HAND_OVER_S if len(records) < MAX_DUE else 0.0, time.monotonic() - now_s))
 

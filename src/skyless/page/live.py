@@ -192,7 +192,7 @@ class LiveSite:
         feed = self.feed
         feed.on(SiteMessage, self._on_site)
         feed.on_bytes("floor_plan", self._on_floor_plan)
-        feed.on(FixMessage, lambda fix, _: self._add_fix(fix, self._clock()))
+        feed.on(FixMessage, lambda fix, _: self.add_fix(fix, self._clock()))
         feed.on(StatusMessage, lambda status, _: self._on_status(status))
         for kind in (TagHealth, AnchorHealth, EtherHealth):
             feed.on(kind, self._on_health)
@@ -267,11 +267,8 @@ class LiveSite:
         digests = {floor: f"{zlib.crc32(image):08x}" for floor, image in self.plans.items()}
         return encode("floor_plan", {"digest": digests.pop(None, None), "floors": digests})
 
-    def on_batched_fix(self, fix: FixMessage, now_s: float) -> None:
-        """Process a fix that arrived in a batch at this time."""
-        self._add_fix(fix, now_s, batched=True)
-
-    def _add_fix(self, fix: FixMessage, now_s: float, *, batched: bool = False) -> None:
+    def add_fix(self, fix: FixMessage, now_s: float, *, batched: bool = False) -> None:
+        """Process a fix that arrived at this time, perhaps in a batch."""
         unix_s = self.wall_clock() - self._clock() + now_s
         if self.evidence.add_fix(fix, now_s, unix_s, batched=batched) is not None:
             self.log.on_fix(fix, now_s)
@@ -392,7 +389,9 @@ class LiveSite:
 
     def recent_fixes(self, after: int = 0) -> list[tuple[FixMessage, float]]:
         """The newest fix of each tag that is fresh and after a serial, with the end time of its last frame."""
-        return self.state.fixes_since(self._clock(), after)
+        now_s, table = self._clock(), self.table
+        newer = [tag for tag in table.fixed.values() if tag.serial > after and table.is_fresh(tag, now_s)]
+        return [(tag.fix, tag.ended_unix_s) for tag in newer if tag.fix is not None]
 
     def presence(self, tag: str) -> Presence:
         """Whether a known tag is there, in a word."""

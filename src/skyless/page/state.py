@@ -109,11 +109,6 @@ class SiteState:
         """Encode rows again, as truth or time may have changed them."""
         self._encoded.clear()
 
-    def fixes_since(self, now_s: float, serial: int = 0) -> list[tuple[FixMessage, float]]:
-        """The newest fix of each tag that is fresh and after a serial, with the end of its last frame as Unix time."""
-        newer = [tag for tag in self.table.fixed.values() if tag.serial > serial and self.table.is_fresh(tag, now_s)]
-        return [(tag.fix, tag.ended_unix_s) for tag in newer if tag.fix is not None]
-
     # Fixes
 
     def state_since(self, serial: int) -> bytes:

@@ -334,7 +334,9 @@ class AlarmEngine:
                     return own.distances_m[subject] < limit + hysteresis
                 return None if any(self._is_missed(name, now_s) for name in subject.split("~")) else False
             case "crowded":
-                return len(self._crowd(own)) > limit - hysteresis or (None if self._was_blind(now_s) else False)
+                return len(self._crowd(own)) > limit - hysteresis or (
+                    None if now_s - self._blind_s < THRESHOLDS.grace_s else False
+                )
             case "anchor-offline" | "anchor-moved" as kind:
                 return subject in self._anchors[kind] if kind in self._anchors else None
         if subject not in own.concerned:
@@ -374,9 +376,6 @@ class AlarmEngine:
     def _battery(tag: Node | None) -> float | None:
         health = None if tag is None else tag.health
         return health.battery_share if isinstance(health, TagHealth) else None
-
-    def _was_blind(self, now_s: float) -> bool:
-        return now_s - self._blind_s < THRESHOLDS.grace_s
 
     def _is_missed(self, name: str, now_s: float) -> bool:
         """Whether a tag may be present although nothing has been received from it since messages were missed."""

@@ -149,10 +149,6 @@ class AnchorNode:
         """Process a subscriber's request for stamps."""
         self.stamps.request(message, time.monotonic())
 
-    def refuse(self, reason: str) -> None:
-        """Count an unusable MQTT message."""
-        self.refused[reason] += 1
-
     async def run(self) -> None:
         """Serve until cancelled."""
         try:
@@ -348,13 +344,12 @@ class Anchors:
         """Return an anchor's connection to the broker."""
         link = link_of(address, node.id, site=self._site.id, kind="anchor")
         if link is not None:
-            site, placed = self._site.id, partial(self._place, node)
-            link.subscribe(
-                request_topic(site), reader(RequestMessage, node.on_request, partial(node.refuse, "bad-request"))
+            bad_request, bad_placement = (
+                partial(node.refused.update, (why,)) for why in ("bad-request", "bad-placement")
             )
-            link.subscribe(
-                placement_topic(site), reader(PlacementMessage, placed, partial(node.refuse, "bad-placement")), qos=1
-            )
+            link.subscribe(request_topic(self._site.id), reader(RequestMessage, node.on_request, bad_request))
+            placed = reader(PlacementMessage, partial(self._place, node), bad_placement)
+            link.subscribe(placement_topic(self._site.id), placed, qos=1)
         return link
 
     def _place(self, node: AnchorNode, message: PlacementMessage) -> None:
@@ -418,39 +413,27 @@ def leads(machine: AnchorMachine, *, is_first: bool) -> bool:
 def health_of(node: AnchorNode, mqtt: Counters, unix_s: float, now_s: float) -> AnchorHealth:
     """State of an anchor since the last call. ``now_s`` is the host's monotonic clock."""
     machine = node.machine
-    now_ticks = node.radio.now_ticks()
+    state = machine.clock(node.radio.now_ticks())
+    is_known = state is not None and state.is_known
     health = AnchorHealth(
         anchor=node.id,
         unix_s=unix_s,
         uptime_s=now_s - node.started_s,
-        role="anchor",
-        master=None,
-        term=None,
-        synchronised=True,
-        offset_s=None,
-        rate_ppm=None,
-        offset_std_m=None,
+        role="anchor" if state is None else _ROLES[state.role],
+        master=None if state is None else state.master,
+        term=None if state is None else state.term or 0,
+        synchronised=state is None or state.is_known,
+        offset_s=None if state is None else state.offset_s,
+        rate_ppm=state.rate_ppm if state is not None and is_known else None,
+        offset_std_m=state.offset_std_m if state is not None and is_known else None,
         sent=machine.counters["sent"],
         late=node.late,
         heard=machine.counters["heard"],
-        superframe=None,
+        superframe=None if state is None else state.superframe,
         heard_age_s={str(anchor): now_s - heard_s for anchor, heard_s in sorted(node.heard_s.items())},
         counters=machine.counters | node.radio.counters | node.refused,
         mqtt=mqtt,
         mode=node.site.schedule.mode,
         missed_share=node.transmissions.drain(),
     )
-    state = machine.clock(now_ticks)
-    if state is None:
-        return node.with_codes(health)
-    return replace(
-        health,
-        role=_ROLES[state.role],
-        master=state.master,
-        term=state.term or 0,
-        synchronised=state.is_known,
-        offset_s=state.offset_s,
-        rate_ppm=state.rate_ppm if state.is_known else None,
-        offset_std_m=state.offset_std_m if state.is_known else None,
-        superframe=state.superframe,
-    )
+    return node.with_codes(health)

@@ -7,7 +7,7 @@ import time
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
-from typing import Final, Literal, Protocol
+from typing import Final, Literal
 
 from msgspec.structs import replace
 
@@ -36,6 +36,7 @@ from skyless.radio.serial.link import ANY_SITE, MODES, OUTPUTS, BoardSettings, p
 from skyless.radio.serial.serial_port import Pty
 from skyless.radio.tag_reports import BODY_AT, fix_body, georeference_body, place_body, status_body
 from skyless.run.fix_log import Lateness
+from skyless.run.open_radio import RadioMonitor
 from skyless.run.process import HEALTH_S, Log, RateLimit, every, together
 
 # A board that is a tag by itself. Like the firmware (``firmware/source/tag.c``), it computes with ``Receiver``, but it
@@ -140,17 +141,18 @@ RADIO_OF: Final[dict[BoardFormat, str]] = {
 """Type of radio in ``--radio`` for a board of each format."""
 
 
-class BoardProtocol(Protocol):
+class BoardProtocol:
     """The protocol of a board's serial line."""
 
     def on_radio_event(self, event: RadioEvent) -> None:
         """Report an event of the radio to the host."""
+        raise NotImplementedError
 
     def on_host_data(self, data: bytes) -> None:
-        """Process bytes from the host."""
+        """Process bytes from the host; most boards take no commands."""
 
 
-class LinkProtocol:
+class LinkProtocol(BoardProtocol):
     """The serial link, as the firmware of real boards speaks it (``firmware/source/board.c``)."""
 
     def __init__(
@@ -279,7 +281,7 @@ def _is_frame(psdu: bytes) -> bool:
     return 3 <= len(psdu) <= link.MAX_FRAME_BYTES and is_intact(psdu)
 
 
-class ListenerProtocol:
+class ListenerProtocol(BoardProtocol):
     """The JSON lines of the uwb-apps listener."""
 
     def __init__(self, send: Send) -> None:
@@ -300,11 +302,8 @@ class ListenerProtocol:
         }
         self._send(json.dumps(line, separators=(",", ":")).encode() + b"\r\n")
 
-    def on_host_data(self, data: bytes) -> None:
-        """Ignore the data: this board takes no commands."""
 
-
-class _BeaconTranslator:
+class _BeaconTranslator(BoardProtocol):
     """Base of emulated boards of other systems, which report beacons as messages of their own systems."""
 
     def __init__(self, send: Send) -> None:
@@ -422,9 +421,6 @@ class UciProtocol(_BeaconTranslator):
         if self._usual <= self._heard or len(self._waiting) >= _MAX_MEASUREMENTS:
             self._notify()
 
-    def on_host_data(self, data: bytes) -> None:
-        """Ignore the data: the session runs from the start."""
-
     def _measurement(self, beacon: Beacon, reception: Reception) -> DtMeasurement | None:
         """Return the measurement to report for a beacon; None if the beacon does not belong to this round."""
         poll, heard = self._poll, beacon.master_heard
@@ -493,8 +489,9 @@ class Board:
         self, radio: Radio, kind: Literal["anchor", "tag"], board_format: BoardFormat, link: Path | None, log: Log
     ) -> None:
         """Open the pseudo-terminal. Raises SkylessError."""
-        self.radio, self._log = radio, log
+        self.radio = radio
         self.pty = Pty(link)
+        self._monitor = RadioMonitor(f"board {radio.name}", "on the air", log, radio.advice)
         self.protocol: BoardProtocol
         if board_format == "link":
             self.protocol = LinkProtocol(radio, self.pty.send, can_transmit=kind == "anchor")
@@ -516,10 +513,6 @@ class Board:
             self.pty.close()
 
     def _on_event(self, event: RadioEvent) -> None:
-        if isinstance(event, Restarted):
-            self._log(f"board {self.radio.name}: on the air")
-        elif isinstance(event, Gone):
-            self._log(f"board {self.radio.name}: {event.reason}; still looking for it")
-        elif isinstance(event, Hint):
-            self._log(f"board {self.radio.name}: {event.text}")
+        if isinstance(event, Restarted | Gone | Hint):
+            self._monitor.on_event(event)
         self.protocol.on_radio_event(event)

@@ -15,7 +15,7 @@ from skyless.radio import emulated as wire
 from skyless.radio.interface import ignore
 from skyless.run.fix_log import MAX_RECEPTION_AGE_S
 from skyless.run.mqtt.address import MqttAddress
-from skyless.run.mqtt.messages import EtherHealth, TrueMotion, TruthMessage, Vector
+from skyless.run.mqtt.messages import EtherHealth, TrueMotion, TruthMessage, vector
 from skyless.run.mqtt.topics import health_topic, truth_topic
 from skyless.run.process import HEALTH_S, Log, every, keep, link_of, most_files, together
 from skyless.sim.impairments import Impairments
@@ -35,27 +35,16 @@ _OTHER_FILES: Final = 192
 """Open files besides processes' connections: the broker's, the libraries', and connections accepted in one turn."""
 
 
-class Session:
-    """The nodes of one process that are on the air."""
-
-    def __init__(self, client: "Client", nodes: tuple[int, ...], wrong_ticks: tuple[int, ...] = ()) -> None:
-        """``wrong_ticks``: by how much each radio's TX antenna delay is set too large."""
-        self._client = client
-        self.nodes = nodes
-        self.wrong_ticks = wrong_ticks or (0,) * len(nodes)
-        self.index = {node: index for index, node in enumerate(nodes)}
-
-    def send(self, message: msgspec.Struct) -> bool:
-        """Send a message to the process; return False if it was dropped because the process does not read."""
-        return self._client.send(message)
-
-
 class Client(asyncio.Protocol):
-    """The connection of one process."""
+    """The connection of one process, and its nodes that are on the air."""
 
     def __init__(self, ether: "Ether") -> None:
         self._ether = ether
-        self._session: Session | None = None
+        self.nodes: tuple[int, ...] = ()
+        self.index: dict[int, int] = {}
+        """Places of the nodes in ``nodes``."""
+        self.wrong_ticks: tuple[int, ...] = ()
+        """By how much each radio's TX antenna delay is set too large."""
         self._unpacker = wire.Unpacker()
         self._transport: asyncio.Transport | None = None
         self._is_counted = False
@@ -90,14 +79,12 @@ class Client(asyncio.Protocol):
 
     def _process(self, body: bytes) -> None:
         message = wire.to_ether.decode(body)
-        if isinstance(message, wire.Join) and self._session is None:
-            answer = self._ether.join(self, message)
-            if isinstance(answer, str):
-                self._refuse(answer)
-            else:
-                self._session = answer
-        elif isinstance(message, wire.Send) and self._session and 0 <= message.node < len(self._session.nodes):
-            self._ether.transmit(self._session, message)
+        if isinstance(message, wire.Join) and not self.nodes:
+            refusal = self._ether.join(self, message)
+            if refusal is not None:
+                self._refuse(refusal)
+        elif isinstance(message, wire.Send) and 0 <= message.node < len(self.nodes):
+            self._ether.transmit(self, message)
         else:
             raise wire.WireError("a message that does not belong here")
 
@@ -108,8 +95,7 @@ class Client(asyncio.Protocol):
 
     def connection_lost(self, exc: Exception | None) -> None:  # noqa: ARG002 - the reason makes no difference
         """Take the process's nodes off the air."""
-        if self._session is not None:
-            self._ether.leave(self._session)
+        self._ether.leave(self)
         self._ether.connections -= self._is_counted
 
 
@@ -134,7 +120,7 @@ class Ether:
         self._columns = *("node", "rx_ticks", "rx_power_dbm", "first_path_power_dbm", "carrier_offset_ppm"), *phase
         self._nodes = {("anchor", str(anchor)): node for anchor, node in self.medium.node_of.items()}
         self._nodes |= {("tag", name): len(site.anchors) + index for index, name in enumerate(tags)}
-        self._owners: dict[int, Session] = {}
+        self._owners: dict[int, Client] = {}
         self._flying: dict[int, int] = {}
         self._origin_s = clock()
         self._most_connections = most_connections
@@ -182,9 +168,9 @@ class Ether:
         """Drop the frames whose time has passed, and notify their senders."""
         for node in self.medium.miss(until_s):
             self._missed += 1
-            session, tx_ticks = self._owners.get(node), self._flying.pop(node, None)
-            if session is not None and tx_ticks is not None:
-                session.send(wire.Done(session.index[node], tx_ticks, late=True))
+            owner, tx_ticks = self._owners.get(node), self._flying.pop(node, None)
+            if owner is not None and tx_ticks is not None:
+                owner.send(wire.Done(owner.index[node], tx_ticks, late=True))
 
     def _arm(self) -> None:
         if self._timer is not None:
@@ -198,16 +184,16 @@ class Ether:
         while True:
             await asyncio.sleep(_CLOCKS_S)
             self.advance()
-            for session in set(self._owners.values()):
-                session.send(wire.Clocks(self.now_host_s, self._counters(session)))
+            for client in set(self._owners.values()):
+                client.send(wire.Clocks(self.now_host_s, self._counters(client)))
 
     @property
     def now_host_s(self) -> float:
         """The host's monotonic time at the medium's present."""
         return self._origin_s + self.medium.now_s
 
-    def _counters(self, session: Session) -> tuple[int, ...]:
-        return tuple(wrap(self.medium.read_counter(node)) for node in session.nodes)
+    def _counters(self, client: Client) -> tuple[int, ...]:
+        return tuple(wrap(self.medium.read_counter(node)) for node in client.nodes)
 
     # Clients
 
@@ -223,7 +209,7 @@ class Ether:
             self._log(f"all {most} connections are in use (limit: ulimit -n); others are refused, these go on")
         return f"all {most} connections of the ether are in use"
 
-    def join(self, client: Client, message: wire.Join) -> Session | str:
+    def join(self, client: Client, message: wire.Join) -> str | None:
         """Put a process's nodes on the air. Returns the reason if that is not possible."""
         nodes = [self._nodes.get((message.kind, name)) for name in message.names]
         for name, node in zip(message.names, nodes, strict=True):
@@ -235,58 +221,56 @@ class Ether:
         if message.tx_delays_ticks and len(message.tx_delays_ticks) != len(nodes):
             return "tx_delays_ticks should have one value a node"
         self.advance()
-        present = tuple(node for node in nodes if node is not None)
-        session = Session(client, present, self._wrong_ticks(present, message.tx_delays_ticks))
-        for node in session.nodes:
-            self._owners[node] = session
-            self.medium.switch_on(node)
-        session.send(wire.Joined(self.machine, self.now_host_s, self._counters(session)))
-        return session
-
-    def _wrong_ticks(self, nodes: tuple[int, ...], delays_ticks: tuple[int, ...]) -> tuple[int, ...]:
-        anchors = self.site.anchors
-        return tuple(
-            delay_ticks - anchors[node].tx_antenna_delay_ticks if node < len(anchors) else 0
-            for node, delay_ticks in zip(nodes, delays_ticks, strict=False)
+        client.nodes = tuple(node for node in nodes if node is not None)
+        client.index = {node: index for index, node in enumerate(client.nodes)}
+        anchors, delays_ticks = self.site.anchors, message.tx_delays_ticks or (None,) * len(nodes)
+        client.wrong_ticks = tuple(
+            delay_ticks - anchors[node].tx_antenna_delay_ticks if delay_ticks is not None and node < len(anchors) else 0
+            for node, delay_ticks in zip(client.nodes, delays_ticks, strict=True)
         )
+        for node in client.nodes:
+            self._owners[node] = client
+            self.medium.switch_on(node)
+        client.send(wire.Joined(self.machine, self.now_host_s, self._counters(client)))
+        return None
 
-    def leave(self, session: Session) -> None:
+    def leave(self, client: Client) -> None:
         """Take a process's nodes off the air."""
-        for node in session.nodes:
+        for node in client.nodes:
             self._owners.pop(node, None)
             self._flying.pop(node, None)
             self.medium.switch_off(node)
 
-    def transmit(self, session: Session, message: wire.Send) -> None:
+    def transmit(self, client: Client, message: wire.Send) -> None:
         """Plan a transmission, unless it is too late or the node's radio already has one waiting.
 
         Raises:
             WireError: the frame is not one that an anchor's radio sends.
         """
-        node = session.nodes[message.node]
+        node = client.nodes[message.node]
         if node >= len(self.site.anchors) or len(message.frame) > MAX_FRAME_BYTES:
             raise wire.WireError("a transmission by a tag, or of a frame that is too long")
         self.advance()
         # a radio starts its frame on multiples of 512, and the antenna's true delay comes on top
-        leaves_ticks = wrap(message.tx_ticks - session.wrong_ticks[message.node])
+        leaves_ticks = wrap(message.tx_ticks - client.wrong_ticks[message.node])
         is_planned = node not in self._flying and self.medium.transmit(node, Transmission(message.frame, leaves_ticks))
         if is_planned:
             self._flying[node] = message.tx_ticks
             self._arm()
         else:
-            session.send(wire.Done(message.node, message.tx_ticks, late=True))
+            client.send(wire.Done(message.node, message.tx_ticks, late=True))
 
     def _deliver(self, delivery: Delivery) -> None:
         """Send a completed frame to all processes whose nodes heard it, and its end to the sender."""
         flight, host_s = delivery.flight, self.now_host_s
-        rows: dict[Session, list[wire.HeardRow]] = {}
+        rows: dict[Client, list[wire.HeardRow]] = {}
         for heard in (delivery.by_anchors, delivery.by_tags):
             for node, *values in zip(*(heard[column].tolist() for column in self._columns), strict=True):
-                session = self._owners.get(node)
-                if session is not None:
-                    rows.setdefault(session, []).append(wire.HeardRow(session.index[node], *values))
-        for session, heard_rows in rows.items():
-            if not session.send(wire.Arrival(flight.frame, host_s, tuple(heard_rows))):
+                owner = self._owners.get(node)
+                if owner is not None:
+                    rows.setdefault(owner, []).append(wire.HeardRow(owner.index[node], *values))
+        for owner, heard_rows in rows.items():
+            if not owner.send(wire.Arrival(flight.frame, host_s, tuple(heard_rows))):
                 self.overruns += len(heard_rows)
         if flight.boot != self.medium.boots[flight.sender]:
             return  # the process that sent it has left meanwhile
@@ -304,7 +288,7 @@ class Ether:
         for name, trajectory in self._tags.items():
             if self._nodes["tag", name] in self._owners:
                 position, velocity = trajectory.position(now_s), trajectory.velocity(now_s)
-                motions[name] = TrueMotion(_vector(position), _vector(velocity))
+                motions[name] = TrueMotion(vector(position.tolist()), vector(velocity.tolist()))
         return TruthMessage(unix_s, motions)
 
     def health(self, unix_s: float) -> EtherHealth:
@@ -328,11 +312,6 @@ class Ether:
         )
 
 
-def _vector(values: object) -> Vector:
-    x, y, z = values.tolist()  # type: ignore[attr-defined]
-    return x, y, z
-
-
 class EtherNode:
     """An ether listening at an address, with an MQTT connection for truth and health."""
 
@@ -353,17 +332,11 @@ class EtherNode:
         async with server:
             parts = [self._ether.send_clocks()]
             if self._link is not None:
+                publish, truth = self._link.publish, truth_topic(self._site)
+                health = health_topic(self._site, "ether", "air")
                 parts += [
                     keep(self._link, self._log),
-                    every(_TRUTH_S, self._publish_truth),
-                    every(HEALTH_S, self._publish_health),
+                    every(_TRUTH_S, lambda: publish(truth, self._ether.truth(time.time() - time.monotonic()))),
+                    every(HEALTH_S, lambda: publish(health, self._ether.health(time.time()))),
                 ]
             await together(*parts)
-
-    def _publish_truth(self) -> None:
-        if self._link is not None:
-            self._link.publish(truth_topic(self._site), self._ether.truth(time.time() - time.monotonic()))
-
-    def _publish_health(self) -> None:
-        if self._link is not None:
-            self._link.publish(health_topic(self._site, "ether", "air"), self._ether.health(time.time()))

@@ -86,9 +86,7 @@ class FixLog:
         mqtt: Counters,
         cpu: float,
         memory_bytes: int,
-        phases: tuple[Phase, ...] = (),
         late_in_link: int = 0,
-        notes: tuple[str, ...] = (),
     ) -> TagHealth:
         """Return the tag's state; some figures cover the time since the last call.
 
@@ -116,11 +114,10 @@ class FixLog:
             mqtt=mqtt,
             cpu=cpu,
             memory_bytes=memory_bytes,
-            phases=phases,
+            phases=(),
             late=self.lateness.dropped + late_fixes,
             lateness_s=self.lateness.drain(),
             interval_s=self._interval_s,
-            notes=notes,
         )
 
 

@@ -51,12 +51,14 @@ class Leaf(Struct, frozen=True, kw_only=True):
         return {"no_advertise": True, "remotes": [remote]}
 
 
-def read_json(file: Path, kind: type[Kind], maker: str) -> Kind:
-    """Read a file of a hub. Raises SkylessError if it cannot be read or was not made by ``maker``."""
+def read_json(file: Path, kind: type[Kind]) -> Kind:
+    """Read a file of a hub. Raises SkylessError if it cannot be read or is none of ``skyless hub init``."""
     try:
         return msgspec.json.decode(file.read_bytes(), type=kind)
     except (OSError, msgspec.DecodeError, UnicodeError) as error:
-        raise SkylessError(f"{file} cannot be used: {getattr(error, 'strerror', error)}; {maker} makes it") from None
+        raise SkylessError(
+            f"{file} cannot be used: {getattr(error, 'strerror', error)}; skyless hub init makes it"
+        ) from None
 
 
 CLUSTER_PORT: Final = 2000

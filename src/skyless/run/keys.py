@@ -180,7 +180,7 @@ def read_private(folder: Path, public: SitePublic) -> "Ed25519PrivateKey":
 
     file = folder / SITE_PRIVATE
     try:
-        private = load_pem_private_key(_read_secret(file), None)
+        private = load_pem_private_key(_read(file, is_secret=True), None)
     except (ValueError, TypeError, UnsupportedAlgorithm):
         private = None
     if not isinstance(private, Ed25519PrivateKey):
@@ -292,15 +292,10 @@ def _read_seed(file: Path) -> bytes | None:
     """Read the seed in a file; None if the file does not exist. Raises SkylessError."""
     if not file.exists():
         return None
-    text = _read_secret(file).strip()
+    text = _read(file, is_secret=True).strip()
     if not re.fullmatch(rb"[0-9a-fA-F]{%d}" % (2 * SEED_BYTES), text):
         raise ConfigurationError(file, "", None, f"{2 * SEED_BYTES} hexadecimal digits")
     return bytes.fromhex(text.decode())
-
-
-def _read_secret(file: Path) -> bytes:
-    """Read a file that only its owner may access. Raises SkylessError."""
-    return _read(file, is_secret=True)
 
 
 def _read(file: Path, *, is_secret: bool = False) -> bytes:

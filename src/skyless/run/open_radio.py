@@ -30,6 +30,11 @@ _EXPECTED: Final = (
 )
 PHONE_PORT: Final = 7470
 
+PACKET_DRIVERS: Final = ("sniffer", "uci", "phone")
+"""Radios that receive packets of another system instead of beacons."""
+STATED_POSITIONS: Final = ("uci", "phone")
+"""Radios whose receptions may state anchor positions."""
+
 
 def is_simulated(spec: str) -> bool:
     """Whether a radio of that name is simulated: emulated, a model, or behind a pseudo-terminal.
@@ -37,22 +42,12 @@ def is_simulated(spec: str) -> bool:
     Check again after a radio has restarted: the path may lead to another device.
     """
     port = spec.partition(":")[2].partition(",")[0].partition("@")[0]
-    return spec.split(":", 1)[0] in ("ether", "model") or os.path.realpath(port).startswith("/dev/pts/")
+    return driver_of(spec) in ("ether", "model") or os.path.realpath(port).startswith("/dev/pts/")
 
 
-def is_ether(spec: str) -> bool:
-    """Whether a radio of that name is one of the emulated air."""
-    return spec.split(":", 1)[0] == "ether"
-
-
-def receives_packets(spec: str) -> bool:
-    """Whether a radio of that name receives packets of another system instead of beacons."""
-    return spec.split(":", 1)[0] in ("sniffer", "uci", "phone")
-
-
-def hears_positions(spec: str) -> bool:
-    """Whether the receptions of a radio of that name may state anchor positions."""
-    return spec.split(":", 1)[0] in ("uci", "phone")
+def driver_of(spec: str) -> str:
+    """What stands before the colon of a radio's name."""
+    return spec.partition(":")[0]
 
 
 def open_radios(

@@ -277,11 +277,6 @@ def recordings_folder() -> Path:
     return folder
 
 
-def new_recording(folder: Path, kind: str) -> Path:
-    """File name for a recording that begins now."""
-    return folder / f"{kind}-{time.strftime('%Y%m%d-%H%M%S')}.mcap"
-
-
 def locked(file: Path) -> IO[str]:
     """Lock a file for this process until it is closed. Raises OSError."""
     lock = file.open("a", encoding="utf-8")

@@ -149,20 +149,13 @@ class Source(Protocol):
         """Call ``handler`` with topic and payload of every message that matches a filter."""
 
 
-class Recorded(Protocol):
-    """A message of a recording."""
+class Recorded(Struct, frozen=True):
+    """One recorded message, with its time of recording and its topic."""
 
-    @property
-    def time_s(self) -> float:
-        """Unix time of recording."""
-
-    @property
-    def channel(self) -> Channel:
-        """What it is."""
-
-    @property
-    def message(self) -> Struct:
-        """The message."""
+    time_s: float
+    channel: Channel
+    topic: str
+    message: Struct
 
 
 Act = Callable[[Any, Channel], object]

@@ -134,7 +134,9 @@ class TagNode:
     def complete(self, health: TagHealth) -> TagHealth:
         """Add phases, multipath and verification to the health message."""
         trusted, phases = self._trusted, self.receiver.phase_anchors
-        health = replace(health, carrier_phase_anchors=phases, on_board=self._board is not None)
+        health = replace(
+            health, phases=self.phases.last, carrier_phase_anchors=phases, on_board=self._board is not None
+        )
         if (note := self.receiver.motion_note) is not None:
             health = replace(health, notes=(*health.notes, note))
         if (multipath := self.receiver.multipath_m) is not None:
@@ -318,7 +320,6 @@ class Tag:
             mqtt=Counters(0, 0, 0) if self.link is None else self.link.counters,
             cpu=cpu,
             memory_bytes=memory_bytes,
-            phases=node.phases.last,
             late_in_link=self._late_before + (0 if self.link is None else self.link.late),
         )
         health = node.complete(counted)

@@ -3,7 +3,7 @@
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final, Generic, TypeVar
+from typing import TYPE_CHECKING, Any, Final, Generic, TypeVar, cast
 
 import numpy as np
 
@@ -13,7 +13,6 @@ from skyless.cli.api.options import PlanOptions
 from skyless.cli.common import cm
 from skyless.core.arrays import Array, Vector
 from skyless.core.errors import SkylessError
-from skyless.core.geometry import Box
 from skyless.core.site import Site
 from skyless.research.verify import random_points, verify
 from skyless.site.channel import ChannelModel
@@ -48,6 +47,8 @@ from skyless.site.planning.report import Verification, described, plan_report
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from pandas import DataFrame
+
+    from skyless.core.geometry import Box
 
 FloorMap = TypeVar("FloorMap", PlanMap, RateMap)
 
@@ -123,20 +124,13 @@ class RatePlanResult(FloorResult[RateMap], frozen=True, eq=False):
             yield "warning", warning
 
 
-def plan_rates(
-    site: Site,
-    file: Path,
-    floor: Floor,
-    heights_m: tuple[float, ...],
-    step_m: float | None,
-    range_m: float | None,
-    exponent: float,
-) -> RatePlanResult:
+def _plan_rates(asked: PlanOptions, site: Site, file: Path) -> RatePlanResult:
     """Plan a site of protocol 2. Raises SkylessError."""
-    started_s = time.perf_counter()
-    channel = ChannelModel() if range_m is None else with_range(ChannelModel(), range_m, exponent)
+    started_s, exponent = time.perf_counter(), asked.exponent or 2.0
+    heights_m, floor = _heights_m(asked, site), _floor(asked, site, file)
+    channel = ChannelModel() if asked.range_m is None else with_range(ChannelModel(), asked.range_m, exponent)
     try:
-        mapped = rate_map(site, floor, heights_m, step_m, channel, exponent)
+        mapped = rate_map(site, floor, heights_m, asked.step_m, channel, exponent)
     except ValueError as error:
         raise SkylessError(f"no map: {error}") from None
     found = rate_report(site, floor, mapped, channel, exponent)
@@ -294,9 +288,7 @@ def run_plan(asked: PlanOptions) -> PlanResult | RatePlanResult:
             *("search_s", "verify_points", "verify_rounds", "seed"),
             why=f"errors are predicted for sites of at most {MAX_PREDICTED} anchors; this one has {len(site.anchors)}",
         )
-        heights_m, exponent = _heights_m(asked, site), asked.exponent or 2.0
-        floor = _floor(asked, site, file)
-        rates = plan_rates(site, file, floor, heights_m, asked.step_m, asked.range_m, exponent)
+        rates = _plan_rates(asked, site, file)
         asked.progress(1.0)
         return rates
     asked.leave_out("exponent", why=f"it is for sites of more than {MAX_PREDICTED} anchors")
@@ -341,11 +333,7 @@ def _heights_m(asked: PlanOptions, site: Site) -> tuple[float, ...]:
 def _floor(asked: PlanOptions, site: Site, file: Path) -> Floor:
     """The floor from the given outline and region of interest. Raises ConfigurationError."""
     outline_m = None if asked.outline_m is None else np.array(asked.outline_m)
-    region_m: Box | None = None
-    if asked.region_m is not None:
-        x1_m, y1_m, x2_m, y2_m = asked.region_m
-        region_m = x1_m, y1_m, x2_m, y2_m
-    return floor_of(site, file, outline_m, region_m)
+    return floor_of(site, file, outline_m, cast("Box | None", asked.region_m))
 
 
 plan = python_function(PlanOptions, run_plan)

@@ -35,21 +35,21 @@ _WORTH_SHIFTING_S: Final = 0.05
 """Offsets of the truth's times up to this are due to the filter itself."""
 
 
-class ReplayResult(Result, frozen=True, eq=False):
+class ReplayResult(Result, frozen=True, eq=False, kw_only=True):
     """Result of a replay."""
 
     path: Path
     reports: dict[str, ReplayReport]
     """Figures of each tag, by its name."""
-    fixes: Fixes
+    fixes: Fixes = FixRecorder(()).fixes()
     """All fixes; ``truth_m`` is NaN where unknown."""
     samples: Mapping[str, FixSamples]
     """An even sample of the fixes of each tag."""
     judged: dict[str, Judged]
     """Which fixes of each tag are judged, and against which truth."""
-    measurements: Measurements
+    measurements: Measurements = MeasurementRecorder(()).measurements()
     """The estimator's input, and whether it was used."""
-    warnings: tuple[str, ...]
+    warnings: tuple[str, ...] = ()
     height_note: str
     """Source of the tags' height."""
     summary: dict[str, Any]
@@ -58,7 +58,7 @@ class ReplayResult(Result, frozen=True, eq=False):
     @property
     def tags(self) -> tuple[str, ...]:
         """Names of the tags; ``tag`` for a single nameless one."""
-        return self.fixes.tags
+        return tuple(self.reports)
 
     def track(self, tag: str) -> Matrix:
         """Time, position, true position and σ of x, y and z of an even sample of a tag's fixes, shape (k, 10)."""
@@ -199,8 +199,14 @@ def _replay_capture(asked: ReplayOptions, begin: Begin, on_measured: OnMeasured 
     asked.progress(1.0)
     summary = {**msgspec.to_builtins(report), "height_note": run.height_note}
     summary["anchor_distances_m"] = distances_of(path, report.format)
-    samples, judged = {"tag": run.samples}, {"tag": run.judged}
-    return _result(path, {"tag": report}, samples, judged, run.height_note, summary)
+    return ReplayResult(
+        path=path,
+        reports={"tag": report},
+        samples={"tag": run.samples},
+        judged={"tag": run.judged},
+        height_note=run.height_note,
+        summary=summary,
+    )
 
 
 def _replay_site(asked: ReplayOptions, begin: Begin, on_measured: OnMeasured | None) -> ReplayResult:
@@ -226,24 +232,15 @@ def _replay_site(asked: ReplayOptions, begin: Begin, on_measured: OnMeasured | N
         reports = run.run(on_fix, lambda done_s: asked.progress(min(max(done_s / span_s, 0.0), 1.0)), on_measured)
     asked.progress(1.0)
     unfinished = f"{path} has no end: it was cut off, or is still being written; later fixes are missing"
-    by_tag: dict[str, ReplayReport] = {report.tag: report for report in reports}
-    judged = {tag: run.judged(tag) for tag in by_tag}
-    warnings = () if found.finished else (unfinished,)
-    return _result(path, by_tag, run.samples, judged, "from the site", summary_of(reports), warnings)
-
-
-def _result(
-    path: Path,
-    reports: dict[str, ReplayReport],
-    samples: Mapping[str, FixSamples],
-    judged: dict[str, Judged],
-    height_note: str,
-    summary: dict[str, Any],
-    warnings: tuple[str, ...] = (),
-) -> ReplayResult:
-    tags = tuple(reports)
-    nothing = FixRecorder(tags).fixes(), MeasurementRecorder(tags).measurements()
-    return ReplayResult(path, reports, nothing[0], samples, judged, nothing[1], warnings, height_note, summary)
+    return ReplayResult(
+        path=path,
+        reports={report.tag: report for report in reports},
+        samples=run.samples,
+        judged={report.tag: run.judged(report.tag) for report in reports},
+        warnings=() if found.finished else (unfinished,),
+        height_note="from the site",
+        summary=summary_of(reports),
+    )
 
 
 def run_replay(asked: ReplayOptions) -> ReplayResult:

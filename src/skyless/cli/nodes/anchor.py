@@ -36,20 +36,16 @@ class AnchorOptions(Options, frozen=True, kw_only=True):
     positions and delays up to 0.5 m from those of its site file."""
 
 
+_Ids = Annotated[int, Parameter(name="IDS", help="Identifiers of one or more anchors in the site file.")]
+
+
 @app.default
 @command
-def anchor(
-    *ids: Annotated[int, Parameter(name="IDS")], asked: AnchorOptions, broker: MqttOptions, output: JsonOptions
-) -> None:
+def anchor(*ids: _Ids, asked: AnchorOptions, broker: MqttOptions, output: JsonOptions) -> None:
     """Run anchors of a site until Ctrl-C; with --json the last health of each is written at the end.
 
     Anchors send at random instants or, at a site of the paper's protocol, in slots on the master's time. They work
     with or without a broker.
-
-    Parameters
-    ----------
-    ids
-        Identifiers of one or more anchors in the site file.
     """
     plan, address = site_named(asked.site), broker.address()
     nodes = {node.id: node for node in plan.all_anchors}

@@ -45,7 +45,7 @@ from skyless.radio.serial.link import MODES, OUTPUTS, BoardSettings
 from skyless.radio.serial.serial_port import check_path
 from skyless.radio.serial.serial_radio import Computing, set_up
 from skyless.run.board import RADIO_OF, Board
-from skyless.run.open_radio import DEFAULT_RADIO, is_ether, open_radios
+from skyless.run.open_radio import DEFAULT_RADIO, driver_of, open_radios
 
 if TYPE_CHECKING:
     from skyless.sim.impairments import AnchorDisplacement
@@ -77,13 +77,11 @@ def board(asked: BoardOptions, output: JsonOptions) -> None:
     skyless tag --from-board), until it is ended, and says records alone.
     """
     name, wire = asked.name, asked.wire
-    if not is_ether(asked.radio):
-        raise SkylessError(f"--radio is {asked.radio!r}; it should be the emulated air, ether:HOST[:PORT]")
+    if driver_of(asked.radio) != "ether":
+        raise wrong("--radio", asked.radio, "the emulated air, ether:HOST[:PORT]")
     kind: Literal["anchor", "tag"] = "anchor" if name.isdecimal() else "tag"
     if kind == "anchor" and wire != "link":
-        raise SkylessError(
-            f"--wire is {wire!r}; it should be link for an anchor, as boards of other formats only listen"
-        )
+        raise wrong("--wire", wire, "link for an anchor, as boards of other formats only listen")
     emulated = Board(open_radios(asked.radio, kind, (name,))[0], kind, wire, asked.link, log)
     path = emulated.pty.name
     if output.json:
@@ -262,9 +260,7 @@ def flash_config(*, asked: FlashOptions, output: JsonOptions) -> None:
     kind, _, port = asked.radio.partition(":")
     path, _, baud = port.partition("@")
     if kind != "serial" or not path or not (baud or "1").isdecimal():
-        raise SkylessError(
-            f"--radio is {asked.radio!r}; it should be a board, serial:PATH[@BAUD], as serial:/dev/ttyACM0"
-        )
+        raise wrong("--radio", asked.radio, "a board, serial:PATH[@BAUD], as serial:/dev/ttyACM0")
     check_path(asked.radio, path)
     changes = (asdict(BoardSettings()) if asked.defaults else {}) | asked.changes()
     bauds = (int(baud),) if baud else _BAUDS

@@ -27,18 +27,16 @@ def _targets() -> str:
 app = App(name="bridge", help_epilogue=_targets())
 
 
+_Targets = Annotated[str, Parameter(name="TARGETS", help="Addresses of one or more targets, as listed below.")]
+
+
 @app.default
 @command
-def bridge(*targets: Annotated[str, Parameter(name="TARGETS")], live: SiteOptions, output: JsonOptions) -> None:
+def bridge(*targets: _Targets, live: SiteOptions, output: JsonOptions) -> None:
     """Give a running site's fixes to programs and devices of other kinds until Ctrl-C.
 
     A reader that is too slow misses fixes and delays nobody. Where a tag has no fix, readers get to know that, in the
     way of each; they never get an old position with a new time.
-
-    Parameters
-    ----------
-    targets
-        Addresses of one or more targets, as listed below.
     """
     address = live.required("the site's broker (skyless tag --to needs none)")
     if not targets:

@@ -64,7 +64,7 @@ def broker(*, asked: BrokerOptions, gathered: GatherOptions, output: JsonOptions
     host, port = listen_address(asked.listen, FIRST_PORT)
     if asked.port is not None and port not in (None, asked.port):
         raise SkylessError(f"--port is {asked.port}, and --listen is {asked.listen!r}; give the port once")
-    leaf = None if asked.hub is None else read_json(asked.hub, Leaf, "skyless hub init")
+    leaf = None if asked.hub is None else read_json(asked.hub, Leaf)
     if leaf is not None:
         gathered.leave_out("site_id", why=f"{asked.hub} is of site {leaf.site}")
         gathered = replace(gathered, site_id=leaf.site)
@@ -200,35 +200,30 @@ async def _keep_history(address: MqttAddress, folder: Path, nats: NatsAddress | 
 gather_app = App(name="gather", help_epilogue="Example: skyless gather --nats nats://127.0.0.1:4222 --site-id 7")
 
 
+class PackOptions(GatherOptions, frozen=True, kw_only=True):
+    """Options of ``skyless gather``."""
+
+    nats: Annotated[str, Parameter(env_var="SKYLESS_NATS")] = "nats://127.0.0.1:4222"
+    """NATS server with JetStream and MQTT, nats://[USER@]HOST[:PORT] or tls://...; the password is taken from
+    SKYLESS_MQTT_PASSWORD."""
+    mqtt: str | None = None
+    """Broker to copy kept messages from: the same server, mqtt://[USER@]HOST[:PORT]. Zones, plans and the like are then
+    in the stream of the site's state from the start, and not from their next change on."""
+
+
 @gather_app.default
 @command
-def gather(
-    *,
-    nats: Annotated[str, Parameter(env_var="SKYLESS_NATS")] = "nats://127.0.0.1:4222",
-    mqtt: str | None = None,
-    asked: GatherOptions,
-    output: JsonOptions,
-) -> None:
+def gather(*, asked: PackOptions, output: JsonOptions) -> None:
     """Pack the fixes of a site's tags into batches until Ctrl-C, and keep them in a stream of NATS.
 
     skyless broker --gather runs it. Several gathers of one site share its fixes. At the end it says what was gathered
     and dropped.
-
-    Parameters
-    ----------
-    nats
-        NATS server with JetStream and MQTT, nats://[USER@]HOST[:PORT] or tls://...; the password is taken from
-        SKYLESS_MQTT_PASSWORD.
-    mqtt
-        Broker to copy kept messages from: the same server, mqtt://[USER@]HOST[:PORT]. Zones, plans and the like are
-        then in the stream of the site's state from the start, and not from their next change on.
     """
     extra_module("nats", "skyless gather")
     from skyless.run.gather.node import Gather
-    from skyless.run.mqtt.address import mqtt_address
 
-    broker = None if mqtt is None else mqtt_address(mqtt)
-    node = Gather(nats_address(nats), asked.site_id, round(1e9 * asked.keep_gb), log, broker)
+    broker = None if asked.mqtt is None else mqtt_address(asked.mqtt)
+    node = Gather(nats_address(asked.nats), asked.site_id, round(1e9 * asked.keep_gb), log, broker)
     run_until_stopped(node.run())
     summary = node.summary
     if output.json:
@@ -281,7 +276,7 @@ def init(*, asked: InitOptions, output: JsonOptions) -> None:
         raise wrong("--tenant", asked.tenant, "a letter, then at most 30 small letters, digits and hyphens")
     if not plan.exists() and len(set(asked.node)) not in {1, 3, 5}:
         raise SkylessError(f"--node was given {len(set(asked.node))} times; it should name 1, 3 or 5 servers")
-    hub = read_json(plan, Hub, "skyless hub init") if plan.exists() else Hub(asked.node)
+    hub = read_json(plan, Hub) if plan.exists() else Hub(asked.node)
     if asked.node not in ((), hub.nodes):
         raise SkylessError(f"--node differs from the nodes in {plan}; it should be left out")
     folders = {"data": asked.data, "certificates": asked.certificates}
@@ -302,18 +297,12 @@ def init(*, asked: InitOptions, output: JsonOptions) -> None:
 
 @hub_app.command
 @command
-def apply(folder: Path, /, *, output: JsonOptions) -> None:
-    """Make the streams of all tenants of a hub, or extend them, and say which sites are heard.
-
-    Parameters
-    ----------
-    folder
-        Folder of skyless hub init.
-    """
+def apply(folder: Annotated[Path, Parameter(help="Folder of skyless hub init.")], /, *, output: JsonOptions) -> None:
+    """Make the streams of all tenants of a hub, or extend them, and say which sites are heard."""
     extra_module("nats", "skyless hub apply")
     from skyless.run.hub import make_streams_of
 
-    hub = read_json(folder / PLAN, Hub, "skyless hub init")
+    hub = read_json(folder / PLAN, Hub)
     found = {tenant: asyncio.run(make_streams_of(hub, tenant, log)) for tenant in hub.sites}
     if output.json:
         print_json({"tenants": found})

@@ -34,6 +34,7 @@ from skyless.machine import extra_module
 from skyless.run.broker import Broker, BrokerSettings, start_broker
 from skyless.run.condition.evidence import ProcessorUse
 from skyless.run.fix_log import Latencies
+from skyless.run.mqtt import topics
 from skyless.run.mqtt.address import PASSWORD_VARIABLE, MqttAddress, mqtt_address
 from skyless.run.mqtt.connection import Introduction, RefusedError, kept_messages, open_connection, trouble_with
 from skyless.run.mqtt.link import Link
@@ -52,22 +53,12 @@ from skyless.run.mqtt.messages import (
     ZonesMessage,
     read_message,
 )
-from skyless.run.mqtt.topics import (
-    alarm_topic,
-    assets_topic,
-    site_topic,
-    status_topic,
-    survey_topic,
-    watch_topic,
-    zones_topic,
-)
 from skyless.run.process import (
     Child,
     Log,
     Program,
     data_folder,
     hold_any,
-    new_recording,
     outlasting,
     recordings_folder,
     reserve_next,
@@ -269,8 +260,8 @@ def survey_record(site: Site) -> SurveyRecord:
 def messages_of(site: Site) -> dict[str, bytes]:
     """Retained messages by topic, as the page would publish them: zones, and the tags' names."""
     return {
-        zones_topic(site.id): msgspec.json.encode(ZonesMessage((_CELL, _GOODS_IN), site=site.name)),
-        assets_topic(site.id): msgspec.json.encode(AssetsMessage(_ASSETS, site=site.name)),
+        topics.zones_topic(site.id): msgspec.json.encode(ZonesMessage((_CELL, _GOODS_IN), site=site.name)),
+        topics.assets_topic(site.id): msgspec.json.encode(AssetsMessage(_ASSETS, site=site.name)),
     }
 
 
@@ -527,7 +518,7 @@ def _recording(asked: str | None, folder: Path) -> Path | None:
     """File of the recording; None for none. Raises SkylessError."""
     if asked == "none":
         return None
-    file = new_recording(folder, "demo") if asked is None else Path(asked)
+    file = folder / time.strftime("demo-%Y%m%d-%H%M%S.mcap") if asked is None else Path(asked)
     if file.exists() or not file.parent.is_dir():
         raise SkylessError(f"--record is {asked!r}; it should be a new file in a folder that exists, or none")
     return file
@@ -565,10 +556,10 @@ async def _cleared_at_the_end(address: MqttAddress, site: int, own: Mapping[str,
 
 
 async def _clear_retained(address: MqttAddress, site: int, own: Mapping[str, bytes]) -> None:
-    topics = (site_topic(site), survey_topic(site), watch_topic(site), status_topic(site, "+", "+"), *own)
-    topics += (alarm_topic(site, "+", "+"),) if own else ()
+    of_site = [topics.site_topic(site), topics.survey_topic(site), topics.watch_topic(site)]
+    of_nodes = [topics.status_topic(site, "+", "+"), *([topics.alarm_topic(site, "+", "+")] if own else [])]
     left: dict[str, bytes] = {}
-    for topic, payload in (await kept_messages(address, topics)).items():
+    for topic, payload in (await kept_messages(address, [*of_site, *of_nodes, *own])).items():
         with contextlib.suppress(WrongMessageError):  # of another program than the demo's
             is_online = topic.endswith("/status") and read_message(payload, StatusMessage).online
             # The demo itself has ended, although a busy broker may not have heard so in time.

@@ -8,7 +8,7 @@ from typing import Annotated, Any, Final
 
 from cyclopts import Parameter
 
-from skyless.arguments import Options, number, read_numbers, whole
+from skyless.arguments import Options, number, read_numbers, whole, wrong
 from skyless.cli.common import plain
 from skyless.core.errors import SkylessError
 from skyless.core.method_names import DEFAULT_METHOD
@@ -98,8 +98,7 @@ def site_named(site: str) -> Site:
     try:
         noise = read_numbers("--site", noise_ps, (1,))[0] if colon else 100.0
     except SkylessError:
-        right = f"a site file, lab, paper, or {name}:PICOSECONDS"
-        raise SkylessError(f"--site is {site!r}; it should be {right}") from None
+        raise wrong("--site", site, f"a site file, lab, paper, or {name}:PICOSECONDS") from None
     return lab_site(noise) if name == "lab" else paper_lab_site(noise, AccuracySite())
 
 
@@ -112,9 +111,7 @@ def listen_address(text: str, usual_port: int) -> tuple[str, int | None]:
         host, digits = text, ""
     host = host.strip("[]")
     if not host or (digits and not (digits.isdecimal() and len(digits) < 6 and int(digits) < 65_536)):
-        raise SkylessError(
-            f"--listen is {text!r}; it should be HOST:PORT, as 127.0.0.1:{usual_port} or [::1]:{usual_port}"
-        )
+        raise wrong("--listen", text, f"HOST:PORT, as 127.0.0.1:{usual_port} or [::1]:{usual_port}")
     return host, int(digits) if digits else None
 
 

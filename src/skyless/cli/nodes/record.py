@@ -4,15 +4,16 @@ import asyncio
 import contextlib
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import msgspec
-from cyclopts import App
+from cyclopts import App, Parameter
 
-from skyless.arguments import Positive
+from skyless.arguments import Options, Positive, wrong
 from skyless.cli.common import (
     NO_FIX,
     JsonOptions,
+    RecordingFile,
     check_output,
     command,
     print_json,
@@ -34,17 +35,18 @@ if TYPE_CHECKING:
 app = App(name="record", help_epilogue="Example: skyless record walk.mcap --duration 60")
 
 
+class RecordOptions(SiteOptions, frozen=True, kw_only=True):
+    """Options of ``skyless record``."""
+
+    duration: Positive | None = None
+    """Seconds to record; by default until Ctrl-C."""
+    limit_mb: Positive | None = None
+    """Megabytes after which the recording ends."""
+
+
 @app.default
 @command
-def record(
-    file: Path | None = None,
-    /,
-    *,
-    live: SiteOptions,
-    duration: Positive | None = None,
-    limit_mb: Positive | None = None,
-    output: JsonOptions,
-) -> int:
+def record(file: Path | None = None, /, *, asked: RecordOptions, output: JsonOptions) -> int:
     """Record a running site until Ctrl-C: raw receptions, fixes, truth, health, site and zones.
 
     skyless replay computes every fix of a recording again; the dashboard and Foxglove show it.
@@ -53,20 +55,16 @@ def record(
     ----------
     file
         The recording, a new MCAP file; by default in this folder, named after the time.
-    duration
-        Seconds to record; by default until Ctrl-C.
-    limit_mb
-        Megabytes after which the recording ends.
     """
     from skyless.run.recordings.recorder import McapFile
 
-    address = live.required("the broker of the site to record")
+    address = asked.required("the broker of the site to record")
     path = file or Path(time.strftime("skyless-%Y-%m-%dT%H-%M-%S.mcap"))
-    out = McapFile(path, None if limit_mb is None else round(limit_mb * 1e6))
+    out = McapFile(path, None if asked.limit_mb is None else round(asked.limit_mb * 1e6))
     found: list[RecorderNode] = []
     with contextlib.suppress(KeyboardInterrupt, TimeoutError):
         try:
-            run(_record(out, address, live.site_id, duration, found))
+            run(_record(out, address, asked, found))
         except SkylessError:
             if not found:
                 path.unlink()  # nothing was recorded
@@ -77,15 +75,12 @@ def record(
     return 1 if out.failed or not found else 0
 
 
-async def _record(
-    file: "McapFile", address: MqttAddress, site_id: int | None, duration_s: float | None, found: "list[RecorderNode]"
-) -> None:
+async def _record(file: "McapFile", address: MqttAddress, asked: RecordOptions, found: "list[RecorderNode]") -> None:
     from skyless.run.record import RecorderNode
 
-    end_s = None if duration_s is None else time.monotonic() + duration_s
-    if site_id is None:
-        async with asyncio.timeout(duration_s):
-            site_id = await find_site(address)
+    end_s = None if asked.duration is None else time.monotonic() + asked.duration
+    async with asyncio.timeout(asked.duration):
+        site_id = await find_site(address) if asked.site_id is None else asked.site_id
     node = RecorderNode(file, address, site_id, log)
     found.append(node)
     before = node.state()
@@ -126,45 +121,37 @@ def _report(path: Path, state: "RecorderState | None", *, json: bool) -> None:
 export_app = App(name="export", help_epilogue="Example: skyless export walk.mcap --to walk_bag")
 
 
+class ExportOptions(Options, frozen=True, kw_only=True):
+    """Options of ``skyless export``."""
+
+    tag: str | None = None
+    """Name of the only tag to write; by default all."""
+    frame: str = "site"
+    """Name of the site's frame in the messages."""
+    transforms: bool = False
+    """Write a transform from that frame to each tag's, too (/tf)."""
+    bag_version: Literal["9", "8"] = "9"
+    """Of the bag's metadata: 9 for ROS 2 from Jazzy on, 8 for Humble and Iron."""
+
+
+_Bag = Annotated[Path, Parameter(help="Where fixes go: the bag, a new folder.")]
+
+
 @export_app.default
 @command
-def export(
-    file: Path,
-    /,
-    *,
-    to: Path,
-    tag: str | None = None,
-    frame: str = "site",
-    transforms: bool = False,
-    bag_version: Literal["9", "8"] = "9",
-    output: JsonOptions,
-) -> int:
+def export(file: RecordingFile, /, *, to: _Bag, asked: ExportOptions, output: JsonOptions) -> int:
     """Write a recording of skyless record as a bag of ROS 2: MCAP, for ros2 bag play, Foxglove, Rerun, PlotJuggler.
 
     Each tag gets the topics pose, velocity, fix (where the site file has a georeference) and truth (where it is
     simulated) below /skyless/TAG; anchors and health become /skyless/anchors and /diagnostics. Needs the extra ros2.
-
-    Parameters
-    ----------
-    file
-        The recording, an MCAP of skyless record.
-    to
-        Where fixes go: the bag, a new folder.
-    tag
-        Name of the only tag to write; by default all.
-    frame
-        Name of the site's frame in the messages.
-    transforms
-        Write a transform from that frame to each tag's, too (/tf).
-    bag_version
-        Of the bag's metadata: 9 for ROS 2 from Jazzy on, 8 for Humble and Iron.
     """
     from skyless.bridges.rosbag import FRAME_NAME, FRAME_RULE, RosEncoder, write_bag
 
     check_output("to", to, file)
-    if not FRAME_NAME.fullmatch(frame):
-        raise SkylessError(f"--frame is {frame!r}; it should be {FRAME_RULE}")
-    bag = write_bag(file, to, RosEncoder(frame, transforms=transforms), tag, 8 if bag_version == "8" else 9)
+    if not FRAME_NAME.fullmatch(asked.frame):
+        raise wrong("--frame", asked.frame, FRAME_RULE)
+    encoder = RosEncoder(asked.frame, transforms=asked.transforms)
+    bag = write_bag(file, to, encoder, asked.tag, 8 if asked.bag_version == "8" else 9)
     if output.json:
         print_json(bag)
     else:

@@ -7,10 +7,10 @@ import re
 import sys
 import threading
 import time
-from collections.abc import Callable, Coroutine, Mapping
+from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Final, Literal, TextIO
+from typing import TYPE_CHECKING, Annotated, Final, Literal, TextIO
 
 from cyclopts import App, Parameter
 from msgspec.structs import replace
@@ -32,11 +32,12 @@ from skyless.run.mqtt.address import MqttAddress
 from skyless.run.mqtt.messages import FixMessage
 from skyless.run.open_radio import (
     DEFAULT_RADIO,
-    hears_positions,
+    PACKET_DRIVERS,
+    STATED_POSITIONS,
+    driver_of,
     is_simulated,
     open_radios,
     open_sniffers,
-    receives_packets,
 )
 from skyless.run.process import Log, together
 from skyless.run.tag import Tags, TagSettings
@@ -47,6 +48,8 @@ if TYPE_CHECKING:
     from skyless.core.air.masterless_packets import Point
     from skyless.run.masterless.packet_tags import PacketTagNode, PacketTags, PacketTagSettings
     from skyless.run.tag import TagNode
+
+    _Opened = tuple[Tags | PacketTags, TagNode | PacketTagNode]
 
 # Fixes as lines on standard output: for people, as CSV, or as JSON.
 #
@@ -240,29 +243,25 @@ class TagOptions(ProtectionOptions, frozen=True, kw_only=True):
     the anchors lie too flat, then theirs."""
 
 
+_Names = Annotated[str, Parameter(name="NAMES", help="Names of one or more tags: letters, digits, - and _.")]
+
+
 @app.default
 @command
-def tag(
-    *names: Annotated[str, Parameter(name="NAMES")], asked: TagOptions, broker: MqttOptions, shown: LineOptions
-) -> None:
+def tag(*names: _Names, asked: TagOptions, broker: MqttOptions, shown: LineOptions) -> None:
     """Run listening tags until Ctrl-C.
 
     A tag needs no configuration: it learns the site from the beacons that it hears. It computes a fix with every
     message, with or without a broker, and publishes fixes on MQTT under skyless/v1/SITE/tag/NAME/fix. With --print,
     --csv or --json it writes the same fixes on standard output.
-
-    Parameters
-    ----------
-    names
-        Names of one or more tags: letters, digits, - and _.
     """
-    address, lines = broker.address(), shown.lines(log, addresses=hears_positions(asked.radio))
+    address, lines = broker.address(), shown.lines(log, addresses=driver_of(asked.radio) in STATED_POSITIONS)
     if not names or len(set(names)) < len(names) or not all(map(_TAG_NAME.fullmatch, names)):
         given = repr(" ".join(names)) if names else "missing"
         raise SkylessError(
             f"NAMES is {given}; it should be one or more names, each once, of 1 to 32 letters, digits, - or _"
         )
-    if receives_packets(asked.radio):
+    if driver_of(asked.radio) in PACKET_DRIVERS:
         asked.leave_out(
             *("site_key", "trust", "clock_bound_ms", "integrity_risk", "alert_limit_m"),
             why="it is not for sniffers, FiRa boards and phones",
@@ -283,30 +282,30 @@ def tag(
         why = "of one tag whose fixes are computed here and at once: one name, --method joint, and neither --from-board"
         raise SkylessError(f"--motion is {why} nor --trust verified")
     bridge = TagBridge(hub_of(asked.to, address), lambda: is_simulated(asked.radio), log) if asked.to else None
-    serve = tags(names, asked, address, _listener(lines, bridge), bridge)
-    others = [part.run() for part in (lines, bridge) if part is not None]
-    run_until_stopped(together(serve, *others), punctual=True)
-
-
-def _listener(lines: FixLines | None, bridge: TagBridge | None) -> FixListener | None:
-    """A function that passes a fix to all consumers; None without any."""
-    listeners = [part.on_fix for part in (lines, bridge) if part is not None]
+    consumers = [part for part in (lines, bridge) if part is not None]
 
     def on_fix(fix: FixMessage) -> None:
-        for listener in listeners:
-            listener(fix)
+        for consumer in consumers:
+            consumer.on_fix(fix)
 
-    return on_fix if listeners else None
+    running, node = tags(names, asked, address, on_fix, bridge)
+    parts = [running.run(), *(consumer.run() for consumer in consumers)]
+    if asked.motion is not None:
+        feed = MotionFeed(asked.motion, node.hear_motion)
+        node.motion_counters = feed.counters
+        log(f"tag {node.radio.name}: waits for its motion at {feed.address}")
+        parts.append(feed.run())
+    run_until_stopped(together(*parts), punctual=True)
 
 
 def _on_radios(
     names: tuple[str, ...],
     asked: TagOptions,
     address: MqttAddress | None,
-    on_fix: FixListener | None,
+    on_fix: FixListener,
     bridge: TagBridge | None,
-) -> Coroutine[Any, Any, None]:
-    """Run tags that receive beacons."""
+) -> "_Opened":
+    """Open tags that receive beacons; the first tag's node."""
     required = asked.requirement(asked.method, asked.tag_height_std)
     trust = _site_trust(asked)
     settings = TagSettings(
@@ -319,19 +318,7 @@ def _on_radios(
     )
     radios = open_radios(asked.radio, "tag", names, computes=asked.from_board)
     tags = Tags(settings, radios, address, log, on_fix, None if bridge is None else bridge.on_health)
-    return _with_motion(asked, tags, tags.tags[0].node)
-
-
-def _with_motion(
-    asked: TagOptions, tags: "Tags | PacketTags", node: "TagNode | PacketTagNode"
-) -> Coroutine[Any, Any, None]:
-    """Run tags, and what receives the motion of the only one. Raises SkylessError."""
-    if asked.motion is None:
-        return tags.run()
-    feed = MotionFeed(asked.motion, node.hear_motion)
-    node.motion_counters = feed.counters
-    log(f"tag {node.radio.name}: waits for its motion at {feed.address}")
-    return together(tags.run(), feed.run())
+    return tags, tags.tags[0].node
 
 
 def _site_trust(asked: TagOptions) -> SiteTrust | None:
@@ -352,10 +339,10 @@ def _on_sniffers(
     names: tuple[str, ...],
     asked: TagOptions,
     address: MqttAddress | None,
-    on_fix: FixListener | None,
+    on_fix: FixListener,
     bridge: TagBridge | None,
-) -> Coroutine[Any, Any, None]:
-    """Run tags that receive the packets of another system."""
+) -> "_Opened":
+    """Open tags that receive the packets of another system; the first tag's node."""
     from skyless.run.masterless.packet_tags import PacketTags
 
     settings = _system(asked)
@@ -378,7 +365,7 @@ def _on_sniffers(
         on_health=None if bridge is None else bridge.on_system_health,
         on_anchors=on_anchors,
     )
-    return _with_motion(asked, tags, tags.nodes[0])
+    return tags, tags.nodes[0]
 
 
 def _system(asked: TagOptions) -> "PacketTagSettings":
@@ -387,7 +374,7 @@ def _system(asked: TagOptions) -> "PacketTagSettings":
     from skyless.run.masterless.packet_tags import TDOA_SITE, PacketTagSettings
     from skyless.site.tables import read_anchors, read_calibration
 
-    if asked.anchors is None and not hears_positions(asked.radio):
+    if asked.anchors is None and driver_of(asked.radio) not in STATED_POSITIONS:
         raise SkylessError("--anchors is missing; a sniffer needs a table of the system's anchors: id,x_m,y_m,z_m")
     anchors_m, std_m = {} if asked.anchors is None else read_anchors(asked.anchors), 0.0
     if asked.tag_height in (None, "auto"):

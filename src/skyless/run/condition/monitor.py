@@ -7,7 +7,7 @@ has a recent fix, and there is no reason against it. If nothing is known it is "
 
 from collections import Counter
 from collections.abc import Collection, Iterable, Mapping, Sequence, Sized
-from typing import Final, Literal
+from typing import Final, Literal, TypeVar
 
 from msgspec import Struct
 from msgspec.structs import replace
@@ -102,6 +102,7 @@ _Statements = dict[str, dict[tuple[str, str], str]]
 """By anchor: the fault of its beacons that each node, by kind and name, states."""
 
 _Severity = Literal["warning", "bad"]
+_Health = TypeVar("_Health", TagHealth, AnchorHealth)
 
 
 class Reason(Struct, frozen=True):
@@ -121,6 +122,12 @@ class Reason(Struct, frozen=True):
 def _of(what: str, kind: str, level: _Severity, text: str, advice: str, names: Iterable[str]) -> Reason:
     """A reason that concerns these tags or anchors."""
     return Reason(kind, level, text, advice, tuple(f"{what}/{name}" for name in list(names)[:_MAX_NAMED]))
+
+
+def _reported(evidence: Evidence, kind: str, health: type[_Health], now_s: float) -> dict[str, _Health]:
+    """Healths of the nodes of a kind that report."""
+    nodes = evidence.table.senders(kind)
+    return {name: one.health for name, one in nodes if one.reports(now_s) and isinstance(one.health, health)}
 
 
 def broker_reason(hub_trouble: str | None) -> Reason:
@@ -388,10 +395,11 @@ def multipath_reason(evidence: Evidence, now_s: float) -> Reason | None:
     """Ranges change more along a tag's path than the site file states."""
     site = evidence.table.site
     stated_m = 0.0 if site is None else site.accuracy.place_std_m
+    healths = _reported(evidence, "tag", TagHealth, now_s).items()
     found = {
-        name: (tag.health.multipath_std_m, tag.health.multipath_distance_m or 0.0)
-        for name, tag in evidence.table.senders("tag")
-        if tag.reports(now_s) and isinstance(tag.health, TagHealth) and tag.health.multipath_std_m is not None
+        name: (one.multipath_std_m, one.multipath_distance_m or 0.0)
+        for name, one in healths
+        if one.multipath_std_m is not None
     }
     more = [name for name, (std_m, _) in found.items() if std_m > MULTIPATH_RATIO * stated_m]
     if not more:
@@ -410,11 +418,7 @@ def multipath_reason(evidence: Evidence, now_s: float) -> Reason | None:
 
 def notes_reason(evidence: Evidence, now_s: float) -> Reason | None:
     """What tags state of another system's anchors."""
-    found = {
-        name: tag.health.notes
-        for name, tag in evidence.table.senders("tag")
-        if tag.reports(now_s) and isinstance(tag.health, TagHealth) and tag.health.notes
-    }
+    found = {name: one.notes for name, one in _reported(evidence, "tag", TagHealth, now_s).items() if one.notes}
     if not found:
         return None
     text = "; ".join(dict.fromkeys(note for notes in found.values() for note in notes))
@@ -453,16 +457,9 @@ def watch_reasons(watch: WatchMessage | None, age_s: float | None) -> Iterable[R
 
 def authentication_reasons(evidence: Evidence, now_s: float) -> Iterable[Reason]:
     """All reasons about codes and keys."""
-    tags = {
-        name: node.health
-        for name, node in evidence.table.senders("tag")
-        if node.reports(now_s) and isinstance(node.health, TagHealth) and node.health.trust is not None
-    }
-    anchors = {
-        name: node.health
-        for name, node in evidence.table.senders("anchor")
-        if node.reports(now_s) and isinstance(node.health, AnchorHealth)
-    }
+    healths = _reported(evidence, "tag", TagHealth, now_s)
+    tags = {name: health for name, health in healths.items() if health.trust is not None}
+    anchors = _reported(evidence, "anchor", AnchorHealth, now_s)
     keyed = {
         name: health
         for name, health in anchors.items()
@@ -691,8 +688,6 @@ def verb(items: Sized, one: str, many: str) -> str:
     """The verb's form for one item or for many."""
     return one if len(items) == 1 else many
 
-
-__all__ = ["Condition", "ConditionMonitor", "offline_anchors"]
 
 EVALUATION_S: Final = 0.5
 """Interval of the evaluations."""

@@ -103,13 +103,13 @@ def span_of(from_text: str, to_text: str | None, now_unix_s: float) -> Span:
     now = datetime.fromtimestamp(now_unix_s)
     begin_s = _unix_s("from", from_text, now, now.date())
     if begin_s > now_unix_s:
-        raise SkylessError(f"from is {from_text!r}, which is in the future ({_shown(begin_s)}); it should be past")
+        raise SkylessError(f"from is {from_text!r}, which is in the future ({time_text(begin_s)}); it should be past")
     end_s = now_unix_s
     if to_text is not None:
         end_s = _unix_s("to", to_text, now, datetime.fromtimestamp(begin_s).date())
     if end_s <= begin_s:
         text = "now" if to_text is None else repr(to_text)
-        raise SkylessError(f"to is {text} ({_shown(end_s)}); it should be later than from ({_shown(begin_s)})")
+        raise SkylessError(f"to is {text} ({time_text(end_s)}); it should be later than from ({time_text(begin_s)})")
     return Span(begin_s, end_s)
 
 
@@ -146,5 +146,6 @@ def _read(text: str, now: datetime, day: date) -> datetime:
     return when if found.period == "time" else when.replace(hour=0, minute=0, second=0, microsecond=0)
 
 
-def _shown(unix_s: float) -> str:
+def time_text(unix_s: float) -> str:
+    """A time for people, in this machine's time zone."""
     return datetime.fromtimestamp(unix_s).isoformat(" ", "seconds")

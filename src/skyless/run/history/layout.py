@@ -72,6 +72,12 @@ def site_folder(folder: Path, site: int) -> Path:
     return folder / f"site={site}"
 
 
+def sites_in(folder: Path) -> tuple[int, ...]:
+    """Numbers of the sites whose history is in a folder."""
+    found = (one.name.removeprefix("site=") for one in folder.glob("site=*"))
+    return tuple(sorted(int(number) for number in found if number.isdecimal()))
+
+
 def file_name(first: int, last: int) -> str:
     """Name of the file with these rows."""
     return f"{first:012}-{last:012}.parquet"

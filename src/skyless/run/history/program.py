@@ -29,7 +29,7 @@ from skyless.run.gather import subjects
 from skyless.run.gather.node import Gather
 from skyless.run.gather.streams import Names, follow, make_streams
 from skyless.run.gather.subjects import NatsAddress, connect, rarely
-from skyless.run.history.layout import FIX_COLUMNS, Place, current_events, current_files, day_of
+from skyless.run.history.layout import FIX_COLUMNS, Place, current_events, current_files, day_of, sites_in
 from skyless.run.history.tables import REMEMBERED_KINDS, Event, EventLog, read_events, read_table, unix_ms
 from skyless.run.history.writer import FILE_ROWS, Intake, Keep, Writer, tidy
 from skyless.run.hub import LIST_S, sites_at
@@ -193,7 +193,8 @@ class SiteHistory:
         """Keep the history until cancelled, then write what waits; what cannot be written is still in the streams."""
         self._stream = stream
         try:
-            await together(self._take_fixes(), self._take_events(), self._take_state(), self._work())
+            others = self._take_others(subjects.EVENT_STREAM, self._writer.events)
+            await together(self._take_fixes(), others, self._take_others(subjects.STATE_STREAM), self._work())
         finally:
             self._try("files", self._writer.close)
 
@@ -219,17 +220,12 @@ class SiteHistory:
         async for message in self._follow(subjects.FIX_STREAM, self._writer.fixes, own):
             await taker.take(message)
 
-    async def _take_events(self) -> None:
-        events = self._writer.events
-        async for message in self._follow(subjects.EVENT_STREAM, events):
-            await _until_room(events)
-            events.place = replace(events.place, number=message.metadata.sequence.stream)
-            self._receive(message)
-
-    async def _take_state(self) -> None:
-        async for message in self._follow(subjects.STATE_STREAM):
+    async def _take_others(self, pattern: str, intake: Intake | None = None) -> None:
+        async for message in self._follow(pattern, intake):
             await _until_room(self._writer.events)
-            self._receive(message)
+            if intake is not None:
+                intake.place = replace(intake.place, number=message.metadata.sequence.stream)
+            self._feed.receive(subjects.topic_of(message.subject), message.data)
 
     async def _follow(
         self, pattern: str, intake: Intake | None = None, subject: str | None = None
@@ -264,9 +260,6 @@ class SiteHistory:
             self._writer.drops["lost-batches" if intake is self._writer.fixes else "lost-events"] += lost
             self._say(f"the stream {name} has dropped {lost} messages before they could be read")
         return intake.place.number
-
-    def _receive(self, message: "Msg") -> None:
-        self._feed.receive(subjects.topic_of(message.subject), message.data)
 
     # Files
 
@@ -489,9 +482,8 @@ class HubHistory:
         client = self._client = await connect(self._address, "skyless history", self._say, self._drops)
         try:
             async with asyncio.TaskGroup() as self._tasks:
-                for folder in self._folder.glob("site=*"):
-                    if (number := folder.name.removeprefix("site=")).isdecimal():
-                        self._keep_site(int(number), client)
+                for number in sites_in(self._folder):
+                    self._keep_site(number, client)
                 self._tasks.create_task(self._find_sites(client))
         except* SkylessError as errors:
             raise errors.exceptions[0] from None

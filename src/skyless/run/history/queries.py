@@ -40,6 +40,7 @@ from skyless.run.history.layout import (
     current_files,
     day_of,
     site_folder,
+    sites_in,
 )
 from skyless.run.history.tables import ROW_GROUP, read_table, schema_of
 from skyless.run.web import HISTORY as LIMITS
@@ -258,12 +259,6 @@ VIEWS: Final = f"""
 
 _P = ParamSpec("_P")
 _R = TypeVar("_R")
-
-
-def sites_in(folder: Path) -> tuple[int, ...]:
-    """Numbers of the sites whose history is in a folder."""
-    found = (one.name.removeprefix("site=") for one in folder.glob("site=*"))
-    return tuple(sorted(int(number) for number in found if number.isdecimal()))
 
 
 def _asked(question: Callable[_P, _R]) -> Callable[_P, _R]:

@@ -237,7 +237,7 @@ class PacketTags:
         for node, link in zip(self.nodes, self._links, strict=True):
             node.fix_log.update_clock_offset()
             node.check_reception(time.monotonic())
-            health = node.fix_log.health(
+            counted = node.fix_log.health(
                 method=_METHOD,
                 receptions=node.packets,
                 reason=str(node.tracking.reason),
@@ -246,8 +246,8 @@ class PacketTags:
                 cpu=share / len(self.nodes),
                 memory_bytes=memory_bytes,
                 late_in_link=0 if link is None else link.late,
-                notes=node.new_notes(self._log),
             )
+            health = structs.replace(counted, notes=node.new_notes(self._log))
             if self._on_health is not None:
                 self._on_health(health)
             if link is not None:

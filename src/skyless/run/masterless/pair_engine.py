@@ -15,6 +15,8 @@ from collections import Counter
 from math import dist
 from typing import Final
 
+from msgspec import Struct
+
 from skyless.core.air.masterless_packets import Packet, PairTdoa, Point, Relay
 from skyless.core.clock_filter import MAX_RELATIVE_RATE, TwoState, predict, update
 from skyless.core.ticks import SPEED_OF_LIGHT_MPS, TICK_M, TICK_RATE_HZ, TICK_S, Unwrapper, difference, nearest
@@ -147,15 +149,12 @@ class BroadcastClock:
 # Time differences
 
 
-class _Anchor:
+class _Anchor(Struct):
     """One anchor at the tag: its clock, and its latest packets by sequence number."""
 
-    __slots__ = ("clock", "packets")
-
-    def __init__(self, clock: BroadcastClock) -> None:
-        self.clock = clock
-        self.packets: dict[int, tuple[int, int]] = {}
-        """Sequence number → unwrapped (tx_ticks of the anchor, rx_ticks of the tag)."""
+    clock: BroadcastClock
+    packets: dict[int, tuple[int, int]] = {}
+    """Sequence number → unwrapped (tx_ticks of the anchor, rx_ticks of the tag)."""
 
 
 def remember(packets: dict[int, tuple[int, int]], sequence: int, tx_ticks: int, rx_ticks: int) -> None:

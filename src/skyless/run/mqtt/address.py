@@ -185,42 +185,31 @@ def _health(*kinds: str) -> tuple[str, ...]:
     return tuple(topics.health_topic(EVERY_SITE, kind, EVERY_NODE) for kind in kinds)
 
 
+def _all(*chosen: topics.Topic) -> tuple[str, ...]:
+    return tuple(topic.everywhere for topic in chosen)
+
+
 _SHOWN: Final = (
-    topics.request_topic(EVERY_SITE),
-    topics.floor_plan_topic(EVERY_SITE),
-    topics.zones_topic(EVERY_SITE),
-    topics.zone_event_topic(EVERY_SITE, "+"),
-    topics.tag_zones_topic(EVERY_SITE, EVERY_NODE),
-    topics.tag_position_topic(EVERY_SITE, EVERY_NODE),
-    topics.assets_topic(EVERY_SITE),
-    topics.alarm_rules_topic(EVERY_SITE),
-    topics.alarm_topic(EVERY_SITE, "+", "+"),
-    topics.acknowledge_topic(EVERY_SITE, "+", "+"),
+    *_all(topics.request_topic, topics.floor_plan_topic, topics.zones_topic, topics.zone_event_topic),
+    *_all(topics.tag_zones_topic, topics.tag_position_topic, topics.assets_topic),
+    *_all(topics.alarm_rules_topic, topics.alarm_topic, topics.acknowledge_topic),
 )
 """What the page publishes, whether or not its users may set up the site."""
 
 ACCESS: Final = {
     Role.ANCHORS: Access(
         publish=(
-            topics.site_topic(EVERY_SITE),
-            topics.floor_plan_topic(EVERY_SITE),
-            topics.plan_of_floor_topic(EVERY_SITE, "+"),
-            topics.stamps_topic(EVERY_SITE, EVERY_NODE),
-            topics.truth_topic(EVERY_SITE),
+            *_all(topics.site_topic, topics.floor_plan_topic, topics.plan_of_floor_topic),
+            *_all(topics.stamps_topic, topics.truth_topic),
             *_status("anchor", "ether"),
             *_health("anchor", "ether"),
         ),
         # A node reads its own status, to correct a late last will.
-        subscribe=(topics.request_topic(EVERY_SITE), topics.placement_topic(EVERY_SITE), *_status("anchor", "ether")),
+        subscribe=(*_all(topics.request_topic, topics.placement_topic), *_status("anchor", "ether")),
     ),
     Role.TAGS: Access(
-        publish=(
-            topics.fix_topic(EVERY_SITE, EVERY_NODE),
-            topics.receptions_topic(EVERY_SITE, EVERY_NODE),
-            *_status("tag"),
-            *_health("tag"),
-        ),
-        subscribe=(topics.request_topic(EVERY_SITE), *_status("tag")),
+        publish=(*_all(topics.fix_topic, topics.receptions_topic), *_status("tag"), *_health("tag")),
+        subscribe=(*_all(topics.request_topic), *_status("tag")),
     ),
     Role.PAGE: Access(
         publish=(
@@ -234,19 +223,14 @@ ACCESS: Final = {
     Role.SURVEY: Access(
         publish=(
             *_SHOWN,
-            topics.survey_topic(EVERY_SITE),
-            topics.survey_facts_topic(EVERY_SITE),
-            topics.survey_save_topic(EVERY_SITE),
-            topics.placement_topic(EVERY_SITE),
-            topics.watch_topic(EVERY_SITE),
+            *_all(topics.survey_topic, topics.survey_facts_topic, topics.survey_save_topic),
+            *_all(topics.placement_topic, topics.watch_topic),
             *_status("dashboard", "survey"),
         ),
         subscribe=("skyless/#",),
     ),
     Role.OPERATOR: Access(publish=(EVERYTHING,), subscribe=(EVERYTHING,)),
-    Role.STRANGER: Access(
-        publish=(), subscribe=(topics.site_topic(EVERY_SITE), topics.fix_topic(EVERY_SITE, EVERY_NODE))
-    ),
+    Role.STRANGER: Access(publish=(), subscribe=_all(topics.site_topic, topics.fix_topic)),
 }
 
 

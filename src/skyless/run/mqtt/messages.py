@@ -639,9 +639,9 @@ def fix_message(tag: str, serial: int, fix: "Fix", unix_s: float, latency_s: flo
         serial=serial,
         unix_s=unix_s,
         time_s=fix.time_s,
-        position_m=_vector(fix.position_m.tolist()),
+        position_m=vector(fix.position_m.tolist()),
         covariance_m2=_matrix(fix.covariance_m2.ravel().tolist()),
-        velocity_mps=_vector(fix.velocity_mps.tolist()) if moving else None,  # type: ignore[union-attr]
+        velocity_mps=vector(fix.velocity_mps.tolist()) if moving else None,  # type: ignore[union-attr]
         velocity_covariance=_matrix(fix.velocity_covariance.ravel().tolist()) if moving else None,  # type: ignore[union-attr]
         std_m=fix.std_m,
         gdop=dops.gdop,
@@ -666,7 +666,8 @@ def fix_message(tag: str, serial: int, fix: "Fix", unix_s: float, latency_s: flo
     )
 
 
-def _vector(values: list[float]) -> Vector:
+def vector(values: list[float]) -> Vector:
+    """Three numbers as a tuple."""
     x, y, z = values
     return x, y, z
 

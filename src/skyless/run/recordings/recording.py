@@ -29,7 +29,8 @@ from skyless.run.mqtt.messages import (
     WrongMessageError,
     ZonesMessage,
 )
-from skyless.run.site_feed import Channel, channel_of, message_of
+from skyless.run.site_feed import Recorded as Recorded  # noqa: PLC0414 - what recordings give
+from skyless.run.site_feed import channel_of, message_of
 
 PROFILE: Final = "skyless"
 JSON: Final = "json"
@@ -257,15 +258,6 @@ def tags_to_replay(summary: RecordingSummary) -> tuple[str, ...]:
     if not summary.raw_tags:
         raise ConfigurationError(summary.path, "raw receptions", None, "a recording that skyless record made")
     return summary.raw_tags
-
-
-class Recorded(Struct, frozen=True):
-    """One recorded message, with its time of recording and its topic."""
-
-    time_s: float
-    channel: Channel
-    topic: str
-    message: Struct
 
 
 class McapRecording:

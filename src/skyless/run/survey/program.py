@@ -16,6 +16,7 @@ from msgspec.structs import replace
 
 from skyless.core.errors import SkylessError
 from skyless.core.site import Site, is_same_but_placed, site_digest
+from skyless.run.mqtt import topics
 from skyless.run.mqtt.address import MqttAddress
 from skyless.run.mqtt.link import Link
 from skyless.run.mqtt.messages import (
@@ -29,18 +30,6 @@ from skyless.run.mqtt.messages import (
     SurveySaveMessage,
     WatchFinding,
     WatchMessage,
-)
-from skyless.run.mqtt.topics import (
-    EVERY_NODE,
-    floor_plan_topic,
-    placement_topic,
-    request_topic,
-    site_topic,
-    stamps_topic,
-    survey_facts_topic,
-    survey_save_topic,
-    survey_topic,
-    watch_topic,
 )
 from skyless.run.process import Log, every, keep, outlasting, reader, together
 from skyless.run.survey.checked_facts import BadFactsError, check_facts
@@ -409,9 +398,9 @@ class SurveyNode:
     def _withdraw(self) -> None:
         """End the lease, and clear the topics that are retained only while this program runs."""
         link, site_id = self.link, self._settings.site_id
-        link.publish(request_topic(site_id), RequestMessage(self._name, (), 0.0), qos=1)
+        link.publish(topics.request_topic(site_id), RequestMessage(self._name, (), 0.0), qos=1)
         if self._settings.serves and not self._waits():
-            for topic in (survey_topic(site_id), watch_topic(site_id)):
+            for topic in (topics.survey_topic(site_id), topics.watch_topic(site_id)):
                 link.publish(topic, b"", qos=1, retain=True)
 
     # Input
@@ -419,19 +408,19 @@ class SurveyNode:
     def _subscribe(self, link: Link) -> None:
         site_id = self._settings.site_id
         link.on_state.append(lambda connected: self._request() if connected else None)
-        topics: list[tuple[str, type[Struct], Callable[..., None], int]] = [
-            (site_topic(site_id), SiteMessage, self._on_site, 1),
-            (stamps_topic(site_id, EVERY_NODE), StampsMessage, self._on_stamps, 0),
+        read: list[tuple[str, type[Struct], Callable[..., None], int]] = [
+            (topics.site_topic(site_id), SiteMessage, self._on_site, 1),
+            (topics.stamps_topic(site_id, topics.EVERY_NODE), StampsMessage, self._on_stamps, 0),
         ]
         if self._settings.serves:
-            topics += [
-                (survey_facts_topic(site_id), SurveyFactsMessage, self._on_facts, 1),
-                (survey_save_topic(site_id), SurveySaveMessage, self._on_save, 1),
-                (placement_topic(site_id), PlacementMessage, self._on_placement, 1),
-                (survey_topic(site_id), SurveyMessage, self._on_survey, 1),
+            read += [
+                (topics.survey_facts_topic(site_id), SurveyFactsMessage, self._on_facts, 1),
+                (topics.survey_save_topic(site_id), SurveySaveMessage, self._on_save, 1),
+                (topics.placement_topic(site_id), PlacementMessage, self._on_placement, 1),
+                (topics.survey_topic(site_id), SurveyMessage, self._on_survey, 1),
             ]
-            link.subscribe(floor_plan_topic(site_id), self._on_image)
-        for topic, kind, act, qos in topics:
+            link.subscribe(topics.floor_plan_topic(site_id), self._on_image)
+        for topic, kind, act, qos in read:
             link.subscribe(topic, reader(kind, act, self._on_wrong), qos)
 
     def _on_wrong(self) -> None:
@@ -439,7 +428,7 @@ class SurveyNode:
 
     def _request(self) -> None:
         message = RequestMessage(self._name, (), LEASE_S, stamps=True)
-        self.link.publish(request_topic(self._settings.site_id), message, qos=1)
+        self.link.publish(topics.request_topic(self._settings.site_id), message, qos=1)
 
     def _on_site(self, message: SiteMessage) -> None:
         self._running = message.site
@@ -475,7 +464,7 @@ class SurveyNode:
         if self._precedence.add(message, time.monotonic()):
             site_id = self._settings.site_id
             self._log(f"survey: another survey program serves site {site_id}: this one waits for its end")
-            self._forget(survey_topic, watch_topic)
+            self._forget(topics.survey_topic, topics.watch_topic)
 
     def _waits(self) -> bool:
         """Whether another program serves the site, so that this one only collects."""
@@ -486,12 +475,12 @@ class SurveyNode:
 
     def _on_placement(self, message: PlacementMessage) -> None:
         if message != self._placement:
-            self._forget(placement_topic)
+            self._forget(topics.placement_topic)
         self._placement = message
 
-    def _forget(self, *topics: Callable[[int], str]) -> None:
+    def _forget(self, *given: Callable[[int], str]) -> None:
         """Stop repeating the own messages on topics that another program now publishes."""
-        for topic in topics:
+        for topic in given:
             self.link.forget(topic(self._settings.site_id))
 
     def _begin(self, site: Site) -> None:
@@ -578,14 +567,14 @@ class SurveyNode:
         if now_s >= self._next_publish_s:
             found = live.message(now_s, unix_s, None if file is None else str(file))
             message = replace(found, by=self._precedence.name)
-            link.publish(survey_topic(site_id), message, qos=1, retain=True)
+            link.publish(topics.survey_topic(site_id), message, qos=1, retain=True)
             pause_s = QUIET_S if message.state == "no data" else max(_UPDATE_S, len(message.pairs) / _PAIRS_PER_S)
             self._next_publish_s = now_s + pause_s - 0.5 * _UPDATE_S
         if watch is not None:
             published = self._watch_published
             if published is None or now_s - published[1] >= QUIET_S or _content(watch) != _content(published[0]):
                 self._watch_published = watch, now_s
-                link.publish(watch_topic(site_id), watch, qos=1, retain=True)
+                link.publish(topics.watch_topic(site_id), watch, qos=1, retain=True)
 
     def _log_state(self, live: LiveSurvey, now_s: float) -> None:
         state = live.state(now_s)
@@ -665,7 +654,7 @@ class SurveyNode:
         self._placement = PlacementMessage(
             unix_s, site_digest(before), replace(saved.site, outline_m=UNSET, alarms=UNSET), earlier
         )
-        self.link.publish(placement_topic(self._settings.site_id), self._placement, qos=1, retain=True)
+        self.link.publish(topics.placement_topic(self._settings.site_id), self._placement, qos=1, retain=True)
         self._running = None  # until the anchors publish it
         self.saved = saved
         live.place(saved.site, saved.record, serial, time.monotonic(), unix_s)
