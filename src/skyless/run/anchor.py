@@ -149,6 +149,10 @@ class AnchorNode:
         """Process a subscriber's request for stamps."""
         self.stamps.request(message, time.monotonic())
 
+    def refuse(self, reason: str) -> None:
+        """Count an unusable MQTT message."""
+        self.refused[reason] += 1
+
     async def run(self) -> None:
         """Serve until cancelled."""
         try:
@@ -344,11 +348,9 @@ class Anchors:
         """Return an anchor's connection to the broker."""
         link = link_of(address, node.id, site=self._site.id, kind="anchor")
         if link is not None:
-            bad_request, bad_placement = (
-                partial(node.refused.update, (why,)) for why in ("bad-request", "bad-placement")
-            )
-            link.subscribe(request_topic(self._site.id), reader(RequestMessage, node.on_request, bad_request))
-            placed = reader(PlacementMessage, partial(self._place, node), bad_placement)
+            asked = reader(RequestMessage, node.on_request, partial(node.refuse, "bad-request"))
+            placed = reader(PlacementMessage, partial(self._place, node), partial(node.refuse, "bad-placement"))
+            link.subscribe(request_topic(self._site.id), asked)
             link.subscribe(placement_topic(self._site.id), placed, qos=1)
         return link
 
