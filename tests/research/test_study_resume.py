@@ -31,7 +31,7 @@ def ran(log, folder, plan=PLAN, name="thirds"):
     """Rows and parts of a study that is its own results, whose work is logged."""
     cells = [Cell("case", partial(computed, log, number), 1.0) for number in NUMBERS]
     study = Study(name, "Thirds", lambda _: cells, lambda _, results: results, print)
-    return run_study(study, plan, lambda _: None, 1, None, folder)
+    return run_study(study, plan, lambda _: None, 1, folder)
 
 
 @pytest.fixture

@@ -7,6 +7,7 @@ import signal
 import sys
 
 import pytest
+from msgspec import structs
 
 from skyless.run import process
 from skyless.run.process import Child, Program, end
@@ -15,6 +16,8 @@ from support.processes import free_port
 from support.waiting import until
 
 pytestmark = pytest.mark.site
+
+PYTHON = (sys.executable, "-c")
 
 
 def alive(pid):
@@ -29,11 +32,10 @@ async def stop(task):
     await stopped(task)
 
 
-async def first_line(monkeypatch, code, name, **options):
+async def first_line(code, name, **options):
     """What is logged first of a program that runs this Python."""
     said = []
-    monkeypatch.setattr(process, "_COMMAND", (sys.executable, "-c", code))
-    task = asyncio.ensure_future(Child(Program(name, (), **options), said.append).run())
+    task = asyncio.ensure_future(Child(Program(name, (code,), command=PYTHON, **options), said.append).run())
     await until(lambda: said or task.done(), 10)
     await stop(task)
     return said[0]
@@ -96,11 +98,11 @@ async def test_a_program_that_cannot_live_is_tried_ever_more_seldom_and_its_last
     ],
 )
 @pytest.mark.parametrize("is_held", [False, True])
-async def test_what_a_killed_program_wrote_last_is_not_taken_for_why_it_ended(monkeypatch, code, message, is_held):
+async def test_what_a_killed_program_wrote_last_is_not_taken_for_why_it_ended(code, message, is_held):
     """Also where it dies in the middle of a line, or its own child holds its standard error open."""
     hold = "import subprocess; subprocess.Popen(['sleep', '5'])" if is_held else "pass"
     code = f"import os, sys; {hold}; {code}; sys.stderr.flush(); os.kill(os.getpid(), 9)"
-    assert await first_line(monkeypatch, code, "tag 2") == f"tag 2 ended (signal 9); {message}; started again"
+    assert await first_line(code, "tag 2") == f"tag 2 ended (signal 9); {message}; started again"
 
 
 async def test_a_program_that_will_not_end_is_made_to(monkeypatch):
@@ -115,29 +117,28 @@ async def test_a_program_that_will_not_end_is_made_to(monkeypatch):
     await end(child)  # once more does nothing
 
 
-async def test_a_very_long_line_of_a_program_s_does_not_end_its_keeper(monkeypatch):
-    line = await first_line(monkeypatch, "import sys; sys.stderr.write('x' * 1_000_000)", "page")
+async def test_a_very_long_line_of_a_program_s_does_not_end_its_keeper():
+    line = await first_line("import sys; sys.stderr.write('x' * 1_000_000)", "page")
     assert line.startswith("page ended (exit code 0); its last message")
     assert 500 < len(line) < 1100
 
 
-async def test_what_a_program_writes_is_logged_as_it_comes_where_that_is_asked_for(monkeypatch):
+async def test_what_a_program_writes_is_logged_as_it_comes_where_that_is_asked_for():
     code = "import sys, time; print('disk full', file=sys.stderr, flush=True); time.sleep(60)"
-    assert await first_line(monkeypatch, code, "history", logs_lines=True) == "history: disk full"
+    assert await first_line(code, "history", logs_lines=True) == "history: disk full"
 
 
-async def test_a_program_with_a_new_file_gets_another_at_every_start_and_ends_when_it_logs_it(monkeypatch, tmp_path):
+async def test_a_program_with_a_new_file_gets_another_at_every_start_and_ends_when_it_logs_it(tmp_path):
     program = Program("recorder", ("record", str(tmp_path / "a.mcap"), "--x"), 1)
     assert program.start(1) == program.arguments
     assert program.start(3) == ("record", str(tmp_path / "a-3.mcap"), "--x")
 
     said = []
-    monkeypatch.setattr(process, "_COMMAND", (sys.executable, "-c", "raise SystemExit(1)"))
-    child = Child(program, said.append)
+    child = Child(structs.replace(program, command=(*PYTHON, "raise SystemExit(1)")), said.append)
     await asyncio.wait_for(child.run(), 10)
     assert child.starts == 1
     assert len(said) == 1
-    monkeypatch.setattr(process, "_COMMAND", (sys.executable, "-c", "import os; os.kill(os.getpid(), 9)"))
+    child = Child(structs.replace(program, command=(*PYTHON, "import os; os.kill(os.getpid(), 9)")), said.append)
     task = asyncio.ensure_future(child.run())
     await until(lambda: child.starts >= 3, 10)
     await stop(task)
