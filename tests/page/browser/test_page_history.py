@@ -230,4 +230,4 @@ def test_without_a_history(hall):
     page = hall[1].page
     page.click("#tab-history")
     page.wait_for_selector("#panel-history:has-text('skyless dashboard --history FOLDER')")
-    assert page.locator("#history-form").is_hidden()
+    page.locator("#history-form").wait_for(state="hidden")

@@ -53,7 +53,7 @@ def test_a_site_comes_later_and_nothing_is_drawn_while_nothing_changes(serve, vi
     server = serve(site=False, tags=0)
     shown = visit(server)
     page = shown.page
-    assert page.locator("#waiting").is_visible()
+    page.locator("#waiting").wait_for()
     shown.until("/^[0-9:]+$/.test(document.getElementById('time').textContent)")  # without any tag
     server.send({"type": "site", "site": made_up.site_message()})
     page.locator("#waiting").wait_for(state="hidden")
@@ -72,10 +72,10 @@ def test_a_cut_connection_is_reported_and_comes_back(hall):
     server.cut()
     page.wait_for_selector("#banner:has-text('Connection lost')")
     assert page.locator("#pill").inner_text() == "Disconnected"
-    assert page.locator("#condition-line").is_hidden()  # the banner says it
+    page.locator("#condition-line").wait_for(state="hidden")  # the banner says it
     page.wait_for_selector("#panel-anchors tr.unknown:has-text('3')")
     visit.until("document.querySelectorAll('#panel-anchors tr:is(.good, .warn, .bad)').length === 0")
-    assert not page.locator("#panel-anchors section:has(.nodes)").is_visible()
+    page.locator("#panel-anchors section:has(.nodes)").wait_for(state="hidden")
     page.click("#panel-anchors button:text-is('3')")
     page.wait_for_selector("#panel-anchors .detail dd:has-text('health unknown')")
     server.refuse, server.full = False, True
@@ -96,7 +96,7 @@ def test_the_condition_has_a_line_a_list_and_buttons_that_show_what_it_is_about(
     visit.until(PILL, "bad")
     assert page.title() == "✕ Hall 7 · Skyless"
     panel = page.locator("#condition-list")
-    assert panel.is_hidden()
+    panel.wait_for(state="hidden")
     page.hover("#pill")
     panel.wait_for()
     assert panel.locator("li").count() == 2
@@ -197,7 +197,7 @@ def test_a_site_with_random_instants_has_no_leader_and_no_superframe(serve, visi
     page.click("#legend summary")
     assert "anchor on the air" in page.locator(".marks").inner_text()
     assert "master" not in page.locator(".marks").inner_text() + page.locator("#panel-anchors").inner_text()
-    assert not page.locator("#tab-timing").is_visible()
+    page.locator("#tab-timing").wait_for(state="hidden")
 
 
 def test_a_floor_plan_lies_where_the_site_says(serve, visit):

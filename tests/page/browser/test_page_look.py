@@ -53,7 +53,7 @@ def test_no_width_scrolls_sideways_and_words_on_the_map_keep_apart(serve, visit,
     shown = visit(server, viewport={"width": width, "height": 720})
     page = shown.page
     page.wait_for_selector("table.tags tr.fresh")
-    assert page.locator("#summary .latency").is_visible() == (width > 900)
+    page.locator("#summary .latency").wait_for(state="visible" if width > 900 else "hidden")
     server.send(watch(moved(4), moved(5)))
     for tab in TABS:
         page.click(f"#tab-{tab}")
@@ -113,9 +113,9 @@ def test_every_control_is_reached_by_tab_shows_it_and_has_a_name_and_tabs_move_w
     page.focus("#tab-tags")
     page.keyboard.press("ArrowRight")
     assert page.evaluate("document.activeElement.id") == "tab-alarms"
-    assert page.locator("#panel-alarms").is_visible()
+    page.locator("#panel-alarms").wait_for()
     page.keyboard.press("End")
-    assert page.locator("#panel-setup").is_visible()
+    page.locator("#panel-setup").wait_for()
 
 
 RUN = """async ([context, rules]) => {

@@ -48,7 +48,7 @@ def test_each_tag_has_an_entry_in_the_legend_beside_the_map_or_on_a_phone_below_
     assert legend["x"] >= room["x"] + room["width"] - 1
     page.click(".tag-marks button:has-text('tag-007')")
     assert page.evaluate("skyless.state.selection.tag") == "tag-007"
-    assert page.locator("#floor").is_hidden()
+    page.locator("#floor").wait_for(state="hidden")
     page.fill("#floor-heights", "0; 3.2 6.5")
     page.press("#floor-heights", "Enter")
     page.reload()
@@ -56,8 +56,8 @@ def test_each_tag_has_an_entry_in_the_legend_beside_the_map_or_on_a_phone_below_
     page.fill("#floor-heights", "ground")
     page.press("#floor-heights", "Enter")
     page.wait_for_selector(".toast.bad:has-text('no list of heights')")
-    assert page.locator("#legend-body").is_visible()
-    assert page.locator(".marks .frame").is_visible()  # of the master's mark
+    page.locator("#legend-body").wait_for()
+    page.locator(".marks .frame").wait_for()  # of the master's mark
     page.click("#legend summary")
     page.set_viewport_size(PHONE)
     shown.frames()
@@ -176,7 +176,7 @@ def test_a_followed_tag_stays_in_the_middle_until_escape(hall):
         assert visit.run("map/tags map/view", middle) < 1.0
     page.focus("#canvas")
     page.keyboard.press("Escape")
-    assert page.locator("#following").is_hidden()
+    page.locator("#following").wait_for(state="hidden")
     assert page.evaluate("skyless.state.selection.tag") == "robot"
 
 
@@ -237,7 +237,7 @@ def test_an_anchor_is_dragged_and_sigma_predicted_again(hall):
     assert f"{anchor['id']},{anchor['x_m']:g},{anchor['y_m']:g},4.25" in lines
     count = len(server.bodies["overlay"])
     page.click("#placing-end")
-    assert page.locator("#placing").is_hidden()
+    page.locator("#placing").wait_for(state="hidden")
     own = "id => skyless.state.site.anchors.find((one) => one.id === id).x_m"
     assert page.evaluate(own, anchor["id"]) != anchor["x_m"]
     visit.until(computed)

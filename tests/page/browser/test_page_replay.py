@@ -59,7 +59,7 @@ def test_it_plays_from_the_first_fix_to_the_end_and_anywhere_and_does_not_look_l
     assert before >= FIRST_FIX_S
     assert page.locator("#past-mark").inner_text().startswith("Replay · recorded 2026-05-28")
     assert page.locator("#pill").inner_text() == "Replay"
-    assert page.locator("#banner").is_hidden()
+    page.locator("#banner").wait_for(state="hidden")
     replay.until(f"before => {AT_S} > before + 0.5", before)
     page.click("#play")
     assert replay.is_shown()
@@ -187,7 +187,7 @@ def test_all_that_is_shown_is_of_the_recording(serve, visit):
     page.click("#tab-anchors")
     page.evaluate("void skyless.state.site.anchors.pop()")
     shown.until("document.querySelectorAll('#panel-anchors tbody tr').length === 7")  # the live site has 8
-    assert page.locator("#panel-anchors h2:text-is('Programs')").is_hidden()
+    page.locator("#panel-anchors h2:text-is('Programs')").wait_for(state="hidden")
     flashes = (
         "import('/page/map/zones.js').then(({ drawZones }) => drawZones(new OffscreenCanvas(1, 1).getContext('2d')))"
     )
@@ -208,7 +208,7 @@ def test_a_recording_without_a_site_or_events_so_far(serve, visit):
     shown = visit(server)
     Replay(shown)
     shown.frames()
-    assert shown.page.locator("#waiting").is_hidden()
+    shown.page.locator("#waiting").wait_for(state="hidden")
     shown.page.click("#tab-events")
     shown.page.wait_for_selector("#panel-events :text-is('Reading the events …')")
     server.waits = set()

@@ -27,10 +27,10 @@ def test_another_site_is_chosen_in_the_header(serve, visit, window):
     mine = page.evaluate("skyless.state.liveId")
     server.send(sites(mine, [1, "lab", False], [mine, "Hall 7", True]))
     shown.until("skyless.state.sites.length === 2")
-    assert page.locator("#sites").is_hidden(), "a site that is gone is not offered"
+    page.locator("#sites").wait_for(state="hidden")  # a site that is gone is not offered
     server.send(sites(mine, [1, "lab", True], [mine, "Hall 7", True]))
     page.wait_for_selector("#sites")
-    assert page.locator("#site-name").is_hidden()
+    page.locator("#site-name").wait_for(state="hidden")
     words = page.evaluate("[...document.querySelectorAll('#sites option')].map((o) => [o.text, o.selected])")
     assert words == [["lab (site 1)", False], [f"Hall 7 (site {mine})", True]]
     box = page.locator("#sites").bounding_box()
@@ -54,8 +54,8 @@ def hub_site(number, condition, reason="", **more):
 def test_the_sites_at_a_hub_are_listed_and_their_pages_change_nothing(hall):
     server, visit = hall
     page = visit.page
-    assert page.locator("#draw").is_visible()
-    assert page.locator("#all-sites").is_hidden()
+    page.locator("#draw").wait_for()
+    page.locator("#all-sites").wait_for(state="hidden")
     halls = [hub_site(1, "cut", reason="not heard for 3 min"), hub_site(2, "good", tags_heard=9, versions={"0.2": 4})]
     server.hub = {"hub": "nats://a:4222", "connected": True, "sites": halls}
     page.goto(server.address)
@@ -68,7 +68,7 @@ def test_the_sites_at_a_hub_are_listed_and_their_pages_change_nothing(hall):
     page.wait_for_url("**/?site=2")
     page.wait_for_selector("#all-sites")
     for change in ("#draw", "#tab-setup", "#add-zone"):
-        assert page.locator(change).is_hidden()
+        page.locator(change).wait_for(state="hidden")
     page.click("#all-sites")
     page.wait_for_selector("tr.good")
     server.hub = {**server.hub, "connected": False}
