@@ -300,6 +300,24 @@ async def test_a_broker_frozen_for_longer_than_the_keepalive_is_left_and_found_a
         await until(lambda: tag.connected)
 
 
+async def test_what_a_broker_has_kept_is_found_also_while_it_is_too_busy_to_answer(make_broker, monkeypatch):
+    broker, topic = make_broker(), status_topic(7, "tag", "t1")
+    connect = connection.open_connection
+
+    async def open_and_freeze(*given):
+        opened = await connect(*given)
+        broker.signal(signal.SIGSTOP)
+        asyncio.get_running_loop().call_later(1.2, broker.signal, signal.SIGCONT)
+        return opened
+
+    async with running(broker):
+        before = await connect(broker.address, None, Introduction("", 10))
+        before.publish(topic, b"kept", 1, retain=True)
+        await before.leave()
+        monkeypatch.setattr(connection, "open_connection", open_and_freeze)
+        assert await connection.kept_messages(broker.address, iter(["skyless/#", "other"])) == {topic: b"kept"}
+
+
 async def test_tls_trusts_only_the_given_certificate(make_broker, certificate):
     broker = make_broker(certificate=certificate[0], key=certificate[1])
     trusting = replace(broker.address, ca=certificate[0])

@@ -342,16 +342,18 @@ async def check_broker(address: MqttAddress, tls: ssl.SSLContext | None = None) 
 async def kept_messages(address: MqttAddress, filters: Iterable[str]) -> dict[str, bytes]:
     """Return the retained messages that match the filters, by topic, and any others that arrive meanwhile.
 
-    Nothing marks the last one: reading ends after half a second without any. Raises OSError and RefusedError.
+    Nothing marks the last one: reading ends after half a second without any, once a broker, which may be busy, has
+    answered the subscriptions. Raises OSError and RefusedError.
     """
     found: dict[str, bytes] = {}
-    react = Reactions(message=found.__setitem__)
+    unanswered = set(filters)
+    react = Reactions(message=found.__setitem__, subscribed=lambda name, _granted: unanswered.discard(name))
     connection = await open_connection(address, address.tls_context(), Introduction("", 60), react)
     try:
-        connection.subscribe(dict.fromkeys(filters, 1))
+        connection.subscribe(dict.fromkeys(unanswered, 1))
         before = -1
         for _ in range(_LONGEST_KEPT):
-            if len(found) == before:
+            if len(found) == before and not unanswered:
                 break
             before = len(found)
             await asyncio.sleep(_KEPT_S)
