@@ -2,6 +2,7 @@
 
 import json
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -14,7 +15,7 @@ from support.waiting import running, until
 pytestmark = pytest.mark.site
 
 NODE = f"""#!{sys.executable}
-import json, os, pathlib, socket, sys
+import json, os, socket, sys
 (port,) = (word.removeprefix("port:=") for word in sys.argv if word.startswith("port:="))
 with socket.create_connection(("127.0.0.1", int(port))) as link, link.makefile("rb") as lines:
     site, fix = next(lines), next(lines)
@@ -41,8 +42,8 @@ def target_of(text, log=print):
 @pytest.mark.parametrize(
     ("text", "domain", "names", "frame", "transforms"),
     [
-        ("ros2://", "3", ("__ns:=/", "__node:=skyless"), "site", "false"),
-        ("ros2://?domain=7&frame=map&namespace=hall/uwb&tf=yes", "7", ("__ns:=/hall", "__node:=uwb"), "map", "true"),
+        ("ros2://", "3", ("__ns:=/", "__node:=skyless"), "'site'", "false"),
+        ("ros2://?domain=7&frame=7&namespace=hall/uwb&tf=yes", "7", ("__ns:=/hall", "__node:=uwb"), "'7'", "true"),
     ],
 )
 async def test_the_node_gets_lines_and_parameters_and_is_started_again(text, domain, names, frame, transforms):
@@ -80,7 +81,8 @@ def test_wrong_settings_are_named(text, words):
         target_of(f"ros2://?{text}")
 
 
-def test_without_the_package_the_message_says_where_to_get_it(node):
-    node.unlink()
+@pytest.mark.parametrize("change", [Path.unlink, lambda node: node.chmod(0o644)])
+def test_without_a_package_that_runs_the_message_says_where_to_get_it(node, change):
+    change(node)
     with pytest.raises(SkylessError, match=r"runs the ROS 2 package skyless_ros2, .*colcon"):
         target_of("ros2://")

@@ -42,7 +42,7 @@ def test_targets_can_be_opened(page, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     node = tmp_path / "lib" / "skyless_ros2" / "node"
     node.parent.mkdir(parents=True)
-    node.touch()
+    node.touch(0o755)
     monkeypatch.setenv("AMENT_PREFIX_PATH", str(tmp_path))
     for text in sorted(targets(page)):
         if any(letters in text for letters in ("HOST", "PORT", "PATH", "[", "192.168.")) or text.endswith((":", "://")):

@@ -3,7 +3,6 @@
 ros2://?domain=0&frame=site&namespace=skyless&tf=no
 """
 
-import asyncio
 import os
 import re
 from pathlib import Path
@@ -16,7 +15,7 @@ from skyless.bridges.rosbag import FRAME_NAME, FRAME_RULE
 from skyless.bridges.target import BridgeContext, Target, TargetUrl
 from skyless.bridges.targets import StreamTarget, TcpServer
 from skyless.core.errors import SkylessError
-from skyless.run.process import Child, Program
+from skyless.run.process import Child, Program, together
 
 _NODE: Final = "lib/skyless_ros2/node"
 """Where it is, as for ``ros2 run``, below a folder of AMENT_PREFIX_PATH."""
@@ -38,11 +37,12 @@ class Ros2Target(StreamTarget):
 
     async def run(self) -> None:
         """Serve until cancelled, and start the node again whenever it ends."""
-        async with asyncio.TaskGroup() as group:
-            group.create_task(self._server.run())
-            await self._server.is_listening.wait()
-            port = ("-p", f"port:={self._server.port}")
-            await Child(replace(self._node, arguments=(*self._node.arguments, *port)), self._log).run()
+        await together(self._server.run(), self._keep_node())
+
+    async def _keep_node(self) -> None:
+        await self._server.is_listening.wait()
+        port = ("-p", f"port:={self._server.port}")
+        await Child(replace(self._node, arguments=(*self._node.arguments, *port)), self._log).run()
 
 
 def make_target(url: TargetUrl, context: BridgeContext) -> Target:
@@ -57,15 +57,16 @@ def make_target(url: TargetUrl, context: BridgeContext) -> Target:
     environment = {"ROS_DOMAIN_ID": str(domain)} if url.has("domain") else {}
     url.check_all_read()
     folders = filter(None, os.environ.get("AMENT_PREFIX_PATH", "").split(os.pathsep))
-    node = next((file for folder in folders if (file := Path(folder) / _NODE).exists()), None)
+    node = next((file for folder in folders if os.access(file := Path(folder) / _NODE, os.X_OK)), None)
     if node is None:
         raise SkylessError(
             f"the target {url.text!r} runs the ROS 2 package skyless_ros2, which this shell does not know: build ros2/ "
             "with colcon and source its setup (docs/tools/ros2.md); for ROS on another computer use jsonl+tcp:"
         )
     above, _, name = namespace.rpartition("/")
-    names = ("-r", f"__ns:=/{above}", "-r", f"__node:={name}")
-    given = f"autostart:=true map_frame:={frame} publish_tag_tf:={transforms} publish_map_to_odom:={transforms}".split()
-    arguments = ("--ros-args", *names, *(word for one in given for word in ("-p", one)))
+    # A value is YAML: without quotes a frame called 7 would be a number.
+    given = ("autostart:=true", f"map_frame:='{frame}'", f"publish_tag_tf:={transforms}")
+    words = (word for one in (*given, f"publish_map_to_odom:={transforms}") for word in ("-p", one))
+    arguments = ("--ros-args", "-r", f"__ns:=/{above}", "-r", f"__node:={name}", *words)
     program = Program(f"{url.text}: node", arguments, logs_lines=True, environment=environment, command=(str(node),))
     return Ros2Target(url.text, program, context)
