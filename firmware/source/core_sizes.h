@@ -7,6 +7,7 @@
 #define PACKETS_KEPT 8
 #define MAX_RELAYS 13
 #define PHASE_STATES 0
+#define HYPOTHESES 0
 #define MOTION_STATES 0
 #define PLANNED_FAULTS 0
 #define PACKED true

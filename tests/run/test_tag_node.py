@@ -79,8 +79,9 @@ def test_a_tag_s_state_names_the_anchors_whose_phases_it_uses():
         counted = bench.node.fix_log.health(
             method="joint", reason=None, counters=Counter(), mqtt=Counters(0, 0, 0), **numbers
         )
-        told.append(bench.node.complete(counted).carrier_phase_anchors)
-    assert told == [(), tuple(sorted(anchor.id for anchor in LAB.anchors))]
+        state = bench.node.complete(counted)
+        told.append((state.carrier_phase_anchors, state.carrier_phase_hypotheses > 0))
+    assert told == [((), False), (tuple(sorted(anchor.id for anchor in LAB.anchors)), True)]
 
 
 def test_pauses_are_not_made_up_for_by_a_burst():

@@ -30,7 +30,7 @@ PROTECTION: Final = 9
 
 ORIENTATION: Final = 10
 """Quaternion w, x, y, z that turns the frame of a motion sensor into the site's, then the heading's standard deviation
-[rad], in two rows; zeros if unknown. Only of methods that use one."""
+[rad], in two rows; zeros if unknown. Only of methods that use one. Last the number of hypotheses on carrier phases."""
 
 PROTECTED_ROWS: Final = 12
 
@@ -137,6 +137,14 @@ class Fix(Struct, frozen=True, gc=False):
     def heading_std_rad(self) -> float | None:
         """Standard deviation of the orientation's heading; None if unknown."""
         return None if self.orientation is None else _row(self.rows, ORIENTATION + 1)[1]
+
+    @property
+    def hypotheses(self) -> int:
+        """Number of positions that are possible by carrier phases: 1 once they are locked, 0 if they are not in use.
+
+        While there are several, phases are locking: the position is the mean, and the covariance covers all of them.
+        """
+        return int(_row(self.rows, ORIENTATION + 1)[2]) if len(self.rows) > (ORIENTATION + 1) * ROW_BYTES else 0
 
     @property
     def chi2(self) -> float:

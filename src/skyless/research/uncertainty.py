@@ -425,7 +425,7 @@ def _prior(anchors: Array, settings: BoundSettings, biases: Biases) -> State:
     s, n = new_state(settings.model(biases)), len(anchors)
     s.status.walk_scale = 1.0
     s.status.has_phases, s.status.phase_variance_m2 = math.isfinite(settings.phase_std_m), settings.phase_std_m**2
-    s.tuning.phase_share = math.inf  # no cycle is ever in doubt
+    s.tuning.phase_walking_mps = math.inf  # no cycle is ever uncertain
     for row, position_m in enumerate(anchors):
         add_anchor(s, row, position_m, -1.0, False)
     s.rows = 0  # nothing is asked of faults

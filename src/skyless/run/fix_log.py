@@ -48,6 +48,7 @@ class FixLog:
         self.update_clock_offset()
         self.serial = 0  # number of the newest fix, which is the number of fixes so far
         self.first_fix_s: float | None = None  # since the start
+        self._hypotheses = 0
         self.last_fix_s: float | None = None  # when the last fix was made, by the host's monotonic clock
         self.due_s = 0.0
         """When the last frame needed for the newest fix ended: the fix's own, or for a verified fix the one with the
@@ -70,6 +71,7 @@ class FixLog:
         self.serial += 1
         self.due_s = ended_s if due_s is None else due_s
         self.last_fix_s = done_s
+        self._hypotheses = fix.hypotheses
         self.latencies.add(done_s - ended_s)
         if self.first_fix_s is None:
             self.first_fix_s = done_s - self.started_s
@@ -115,6 +117,7 @@ class FixLog:
             cpu=cpu,
             memory_bytes=memory_bytes,
             phases=(),
+            carrier_phase_hypotheses=self._hypotheses,
             late=self.lateness.dropped + late_fixes,
             lateness_s=self.lateness.drain(),
             interval_s=self._interval_s,

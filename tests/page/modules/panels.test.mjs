@@ -63,11 +63,11 @@ test("a tag has figures and facts; without keys it says nothing of codes", () =>
 
 test("a tag says what it verifies, which phases it uses, where it computes, and why it has no fix", () => {
   const says = { trust: "open", is_verified: false, clock_error_s: -3.25, faults: { 3: "bad-code" }, reason: "too-few-anchors" };
-  send(health({ of: { a: { ...says, carrier_phase_anchors: [1, 2, 5], on_board: true } } }));
+  send(health({ of: { a: { ...says, carrier_phase_anchors: [1, 2, 5], carrier_phase_hypotheses: 3, on_board: true } } }));
   const facts = tags.facts({ tag: "a" });
   assert.deepEqual([facts.Verified, facts.Clock], [["nothing is verified", "bad"], ["3.3 s behind the site's", "bad"]]);
   assert.deepEqual(facts["Not accepted"], ["anchor 3: wrong code: forged, or another seed", "bad"]);
-  assert.deepEqual([facts["Carrier phases"][0], facts.Method[0]], ["of anchors 1, 2, 5", "joint, on its board (emulated)"]);
+  assert.deepEqual([facts["Carrier phases"][0], facts.Method[0]], ["of anchors 1, 2, 5, locking (3 left)", "joint, on its board (emulated)"]);
   assert.equal(tags.part.all(({ className }) => className === "reason")[0].textContent, "No fix: too few anchors");
   assert.deepEqual(tags.rows().map(([, , name]) => name), ["a not verified", "b"]);
   const row = [...feed.findLast(({ type }) => type === "state").tags[0]];

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from skyless.core.arrays import Integers, Matrix, Vector
 from skyless.core.estimator import compiled
 from skyless.core.estimator.compiled import add_anchor, find_anchor, fit_plane, restart
-from skyless.core.estimator.faults import has_phase, horizontal_variance_m2, is_late_often, rejects_most
+from skyless.core.estimator.faults import horizontal_variance_m2, is_late_often, rejects_most
+from skyless.core.estimator.kalman import has_phase
 from skyless.core.estimator.motion import GRAVITY_MPS2, heading_std_rad
 from skyless.core.estimator.process import (
     REJECTED,

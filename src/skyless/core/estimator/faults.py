@@ -317,12 +317,6 @@ def relays_fit(s: State) -> bool:
     return status.relays_lately_accepted > max(s.tuning.max_relays_rejected, 4.0 * status.relays_lately_rejected)
 
 
-def has_phase(s: State, anchor: int) -> bool:
-    """Whether an anchor's phases are in use: its ambiguity is confirmed, and phases are not being rejected."""
-    own = s.anchors[anchor].own
-    return own.is_known and own.refused_in_row < int(s.tuning.phases_in_row) - 1
-
-
 def horizontal_variance_m2(s: State, ahead_s: float) -> float:
     """Sum of the variances of x and y after ``ahead_s`` without receptions."""
     total = 2.0 * motion_noise(s) * ahead_s * ahead_s * ahead_s / 3.0

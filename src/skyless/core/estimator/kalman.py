@@ -38,6 +38,8 @@ def predict(s: State, rx_ticks: Ticks) -> None:
         status.obstruction *= exp(-dt / s.tuning.obstruction_memory_s)
     for axis in range(s.dim):
         status.line_m[axis] += s.x[where.velocity + axis] * dt
+    if status.has_phases:
+        status.recent_square = max(status.recent_square * exp(-dt / s.tuning.speed_memory_s), speed_squared(s))
     _advance(s, dt)
     motion, white_m2 = motion_noise(s), settings.white * dt
     if MOTION_STATES > 0 and s.motion.is_used:
@@ -67,8 +69,34 @@ def speed_squared(s: State) -> float:
 
 
 def motion_noise(s: State) -> float:
-    """Spectral density of the tag's acceleration, m²/s³: as innovations require, and what a fast tag's turns need."""
-    return s.settings.qa * max(s.status.q_scale, speed_squared(s) / square(s.tuning.walking_mps))
+    """Spectral density of the tag's acceleration, m²/s³: as innovations require, and what a fast tag's turns need.
+
+    Hypotheses on cycles need it to be large beforehand: if it is too small, wrong cycles explain the motion.
+    """
+    tuning, status, least = s.tuning, s.status, speed_squared(s) / square(s.tuning.walking_mps)
+    if are_phases_reliable(s):
+        least = status.recent_square / square(tuning.phase_walking_mps)
+    return s.settings.qa * max(status.q_scale, least)
+
+
+def has_phase(s: State, anchor: int) -> bool:
+    """Whether an anchor's phases are in use: its ambiguity is confirmed, and phases are not being rejected."""
+    own = s.anchors[anchor].own
+    return own.is_known and own.refused_in_row < int(s.tuning.phases_in_row) - 1
+
+
+def follows_cycles(s: State) -> bool:
+    """Whether phases of enough anchors are in use to determine the tag's clock."""
+    found = 0
+    for anchor in range(s.count):
+        if has_phase(s, anchor):
+            found += 1
+    return found > s.dim
+
+
+def are_phases_reliable(s: State) -> bool:
+    """Whether phases are in use, are rarely wild, and range errors have not jumped of late: cycles may be uncertain."""
+    return s.status.has_phases and s.status.wild_share < s.tuning.most_wild and jump_share(s) < 1.0
 
 
 def _unseen_noise(s: State) -> float:
@@ -295,6 +323,9 @@ def _note_update(s: State, innovation: float, innovation_variance: float, gain_s
         u[state] *= inverse
     for fault in range(s.rows):
         g[fault] *= step
+    for one in range(s.hypotheses.count):
+        off = innovation * inverse + g[FAULT_KINDS * s.count + one]
+        s.hypotheses.log_weight[one] -= 0.5 * off * off
     step *= innovation
     for state in range(s.used):
         s.x[state] += u[state] * step

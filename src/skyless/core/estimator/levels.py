@@ -13,7 +13,7 @@ jump or by yᵀ·(M + I/σ_f²)⁻¹·y, which is χ² without faults; then no l
 from typing import Final
 
 from skyless.core.estimator.faults import fault_chi2, whiten
-from skyless.core.estimator.monitor import covariance_scale, is_warm
+from skyless.core.estimator.monitor import is_warm, motion_covariance
 from skyless.core.estimator.state import AXES, FAULT_KINDS, LASTING, State, at
 from skyless.core.integrity import CONTRADICTED, HPL, OBSTRUCTED, SOUND, UNAVAILABLE, VPL
 from skyless.core.native.arithmetic import hypot, sqrt, square
@@ -29,7 +29,7 @@ _SWEEPS: Final = 8
 
 def protect(s: State) -> None:
     """Compute the levels in metres and the tests of faults."""
-    levels, scale = s.levels, covariance_scale(s)
+    levels = s.levels
     levels[HPL] = levels[VPL] = 0.0
     for kind in range(FAULT_KINDS):
         levels[FIRST_TEST + kind] = fault_chi2(s, kind, s.dim)
@@ -37,7 +37,7 @@ def protect(s: State) -> None:
         first = s.count + 1 + (AXES if kind == LASTING else 0)
         of_x, of_y, of_z = s.work[first], s.work[first + 1], s.work[first + 2]
         shift_x, shift_y, shift_z = 0.0, 0.0, 0.0
-        xx, xy, yy, zz = scale * s.P[at(0, 0)], scale * s.P[at(0, 1)], scale * s.P[at(1, 1)], 0.0
+        xx, xy, yy, zz = motion_covariance(s, 0, 0), motion_covariance(s, 0, 1), motion_covariance(s, 1, 1), 0.0
         for one in range(s.count):
             shift_x += x[one] * faults[one]
             shift_y += y[one] * faults[one]
@@ -50,7 +50,7 @@ def protect(s: State) -> None:
         largest = 0.5 * (xx + yy) + sqrt(0.25 * square(xx - yy) + xy * xy)
         levels[HPL] = max(levels[HPL], hypot(shift_x, shift_y) + s.horizontal_k * sqrt(largest))
         if s.dim == 3:
-            levels[VPL] = max(levels[VPL], abs(shift_z) + s.vertical_k * sqrt(scale * s.P[at(2, 2)] + zz))
+            levels[VPL] = max(levels[VPL], abs(shift_z) + s.vertical_k * sqrt(motion_covariance(s, 2, 2) + zz))
 
 
 def largest_test(s: State) -> float:

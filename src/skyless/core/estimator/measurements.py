@@ -205,7 +205,7 @@ def own_reception(s: State, anchor: int, rx_ticks: Ticks, tx_ticks: Ticks, varia
     a.innovation = innovation / sqrt(innovation_variance)
     if not is_late_often(s):  # late packets are no multipath
         learn_place(s, anchor, innovation + s.x[where.change + anchor])
-    if is_warm(s) and abs(a.innovation) > tuning.common and is_common(s, a.innovation):
+    if is_warm(s) and is_common(s, a.innovation):
         status.walk_scale = tuning.max_walk_scale
         a.outliers_in_row = 0
     elif is_warm(s):

@@ -19,10 +19,12 @@ Anchors that are late from the start, or increasingly late without a jump, are f
 from typing import Final
 
 from skyless.core.estimator.faults import begin_obstruction, is_late_often
-from skyless.core.estimator.kalman import finish_updates
+from skyless.core.estimator.hypotheses import scatter
+from skyless.core.estimator.kalman import finish_updates, follows_cycles
 from skyless.core.estimator.state import CHANGING_RANGE_ERRORS, State, at, make_uncertain
 from skyless.core.native.arithmetic import log, sqrt, square
 from skyless.core.native.records import MOTION_STATES
+from skyless.core.ticks import TICK_M, TICK_S
 
 _PLACE_LIMIT: Final = 2.0
 """Squared differences of range errors are limited to this multiple of their mean, as jumps are not multipath."""
@@ -57,12 +59,15 @@ def has_jumped(s: State, anchor: int) -> bool:
 def is_common(s: State, normalised: float) -> bool:
     """Whether the newest innovations of all anchors but at most one small one are on the side of this innovation.
 
-    The tag's clock is the cause then. A faulty anchor draws the others to the opposite side of its own.
+    The tag's clock is the cause then. A faulty anchor draws the others to the opposite side of its own. While phases
+    determine the clock, stamps of all anchors may well err to one side.
     """
-    others = 0
+    others, limit = 0, s.tuning.suspect if follows_cycles(s) else s.tuning.common
+    if abs(normalised) <= limit:
+        return False
     for anchor in range(s.count):
         newest = s.anchors[anchor].innovation
-        if abs(newest) <= s.tuning.common:
+        if abs(newest) <= limit:
             others += 1
         elif newest * normalised <= 0.0:
             others += 2
@@ -92,13 +97,13 @@ def adapt_change_noise(s: State, anchor: int, normalised: float) -> None:
     """Adapt the process noise of an obstructed anchor's range error to an innovation."""
     a = s.anchors[anchor]
     a.change_mean += s.tuning.mean_gain * (normalised - a.change_mean)
-    a.change_scale = _adapted(s, a.change_scale, _is_off_zero(s, a.change_mean), s.tuning.max_scale)
+    a.change_scale = _adapted(s, a.change_scale, _is_off_zero(s, a.change_mean), 1.0, s.tuning.max_scale)
 
 
-def _adapted(s: State, scale: float, is_too_small: bool, largest: float) -> float:
+def _adapted(s: State, scale: float, is_too_small: bool, least: float, largest: float) -> float:
     """Factor on process noise after an innovation, which shows whether the noise is too small."""
     scale *= s.tuning.noise_growth if is_too_small else s.tuning.noise_loss
-    return min(max(scale, 1.0), largest)
+    return min(max(scale, least), largest)
 
 
 def _is_off_zero(s: State, mean: float) -> bool:
@@ -236,17 +241,56 @@ def adapt_process_noise(s: State, normalised: float) -> None:
     if lag_square > tuning.sudden_lag:
         status.q_scale = min(2.0 * status.q_scale, tuning.max_scale)
     else:
-        status.q_scale = _adapted(s, status.q_scale, status.lag_square > tuning.lag_limit, tuning.max_scale)
+        status.q_scale = _adapted(s, status.q_scale, status.lag_square > tuning.lag_limit, 1.0, tuning.max_scale)
     status.common_mean += gain * (normalised - status.common_mean)
-    is_clock_off = _is_off_zero(s, status.common_mean)
-    status.walk_scale = _adapted(s, status.walk_scale, is_clock_off, tuning.max_walk_scale)
+    is_clock_off = _is_off_zero(s, status.common_mean) and not follows_cycles(s)
+    least = max(_least_scale(s, status.tag_walk), _least_scale(s, status.anchors_walk))
+    status.walk_scale = _adapted(s, status.walk_scale, is_clock_off, least, tuning.max_walk_scale)
 
 
 def adapt_clock_noise(s: State, anchor: int, normalised: float) -> None:
     """Adapt the process noise of an anchor's clock to a relay's innovation."""
     a = s.anchors[anchor]
     a.relay_mean += s.tuning.mean_gain * (normalised - a.relay_mean)
-    a.walk_scale = _adapted(s, a.walk_scale, _is_off_zero(s, a.relay_mean), s.tuning.max_walk_scale)
+    least = _least_scale(s, s.status.anchors_walk)
+    a.walk_scale = _adapted(s, a.walk_scale, _is_off_zero(s, a.relay_mean), least, s.tuning.max_walk_scale)
+
+
+def _least_scale(s: State, walk: float) -> float:
+    """Factor on the settings' random walk of a clock below which it is not adapted, by what its rates have shown."""
+    if s.status.rate_changes < 2:
+        return 1.0
+    return min(max(walk / s.settings.walk, s.tuning.least_walk_scale), s.tuning.max_walk_scale)
+
+
+def learn_least_walk(s: State) -> None:
+    """Learn how little the clocks wander, from the changes of their mean rates.
+
+    From one interval τ to the next a rate changes with the variance 2/3·walk·τ; the stamps' noise only adds to it. The
+    mean change of all offsets is the tag's clock, and the rest are the anchors'.
+    """
+    status, tuning = s.status, s.tuning
+    elapsed_s = (status.epoch_ticks - status.rate_ticks) * TICK_S
+    if elapsed_s < tuning.rate_s:
+        return
+    is_long, found, mean, square_sum = elapsed_s > 2.0 * tuning.rate_s, 0, 0.0, 0.0
+    for anchor in range(s.count):
+        a, offset_m = s.anchors[anchor], s.x[s.layout.offset + anchor]
+        rate_mps = ((a.offset_ticks - a.rate_offset_ticks) * TICK_M + (offset_m - a.rate_offset_m)) / elapsed_s
+        change_mps = rate_mps - a.mean_rate_mps
+        a.rate_offset_ticks, a.rate_offset_m, a.mean_rate_mps = a.offset_ticks, offset_m, rate_mps
+        a.rates = 1 if is_long or not a.has_rate else a.rates + 1
+        if a.rates > 2:
+            found += 1
+            square_sum += square(change_mps - mean) * (found - 1) / found
+            mean += (change_mps - mean) / found
+    if found > s.dim:
+        walk_s = 3.0 / (elapsed_s + status.rate_s)
+        status.rate_changes += 1
+        gain = 1.0 / min(status.rate_changes, int(tuning.rate_changes))
+        status.tag_walk += gain * (square(mean) * walk_s - status.tag_walk)
+        status.anchors_walk += gain * (square_sum / (found - 1) * walk_s - status.anchors_walk)
+    status.rate_ticks, status.rate_s = status.epoch_ticks, elapsed_s
 
 
 def covariance_scale(s: State) -> float:
@@ -256,3 +300,8 @@ def covariance_scale(s: State) -> float:
     """
     nis = s.status.mean_nis
     return nis * nis if nis > s.tuning.wrong_nis else 1.0
+
+
+def motion_covariance(s: State, state: int, other: int) -> float:
+    """Covariance of two states of position or velocity, as a fix and its levels state it."""
+    return covariance_scale(s) * s.P[at(state, other)] + scatter(s, state, other)

@@ -9,13 +9,22 @@ reflections, which changes as the tag walks. It is estimated as a real number: a
 anchors turn, and ranges known to millimetres up to a constant determine the position. ``docs/maths.md`` section 6.7.
 
 A wrong cycle in fast motion looks consistent and drags the position by metres. So a phase is used only together with a
-stamp that was used, and only if it is predicted to a tenth of a wavelength; otherwise its ambiguity starts again, which
-provides no information. If stamps contradict the state, all ambiguities start again.
+stamp that was used. If it is not predicted to a tenth of a wavelength, it is taken at each cycle that is possible
+(``hypotheses``); where these are too many, or phases are often wrong, its ambiguity starts again, which provides no
+information. If stamps contradict the state, or the hypotheses stay apart, all ambiguities start again.
 """
 
 from typing import Final
 
-from skyless.core.estimator.kalman import compute_fault_input, compute_ph, finish_updates, reset_state, update
+from skyless.core.estimator.hypotheses import give_up_hypotheses, scatter, settle_hypotheses, take_cycles
+from skyless.core.estimator.kalman import (
+    are_phases_reliable,
+    compute_fault_input,
+    compute_ph,
+    finish_updates,
+    reset_state,
+    update,
+)
 from skyless.core.estimator.measurements import (
     add_direction_from,
     add_term,
@@ -26,6 +35,7 @@ from skyless.core.estimator.measurements import (
     relay_terms,
     relay_variance,
 )
+from skyless.core.estimator.monitor import learn_least_walk
 from skyless.core.estimator.state import Ambiguity, State, at, set_covariance, use_phases
 from skyless.core.native.arithmetic import floor, log, sqrt, square
 from skyless.core.native.records import Reals, Ticks
@@ -45,10 +55,11 @@ def own_phase(s: State, anchor: int, phase_cycles: float) -> None:
     use_phases(s)
     finish_updates(s)
     if not a.has_rate or not _may_count(s):
-        a.own.is_known = a.has_former = False
+        a.own.is_known = False
         return
     ambiguity = s.layout.ambiguity + anchor
     _measure_way(s)
+    learn_least_walk(s)
     if a.own.is_known:
         wander = max(tuning.phase_wander * status.phase_variance_m2, s.settings.phase_wander)
         s.P[at(ambiguity, ambiguity)] += wander * (status.way_m - a.phase_way_m)
@@ -58,16 +69,11 @@ def own_phase(s: State, anchor: int, phase_cycles: float) -> None:
     cycles = -phase_cycles - _whole_cycles(s, a.offset_ticks)
     innovation, variance = _innovation_m(s, cycles, expected_m), status.phase_variance_m2
     predicted = compute_ph(s)
-    if a.own.is_known and predicted > _certain_m2(s):
-        _keep_former(s, anchor)
-    outcome = _use_phase(s, ambiguity, a.own, innovation, variance)
-    if outcome == PHASE_REFUSED:
-        status.wild_share += tuning.slow_forgetting * (1.0 - status.wild_share)
-    elif outcome == PHASE_USED:
-        status.wild_share -= tuning.slow_forgetting * status.wild_share
+    outcome = _use_phase(s, ambiguity, a.own, innovation, variance, True)
+    if outcome != PHASE_BEGINS:
+        _count_wild(s, predicted + variance)
+    if outcome == PHASE_USED and predicted <= _certain_m2(s) and s.hypotheses.count == 0:
         _learn_noise(s, square(innovation) - predicted)
-        if a.has_former:
-            _rejoin(s, anchor)
 
 
 def relay_phase(s: State, listener: int, sender: int, packet_rx_ticks: Ticks, phase_cycles: float) -> None:
@@ -90,7 +96,8 @@ def relay_phase(s: State, listener: int, sender: int, packet_rx_ticks: Ticks, ph
     cycles = -phase_cycles - _whole_cycles(s, j.offset_ticks - i.offset_ticks)
     variance = square(s.tuning.phase_mesh_std_m) + relay_variance(s, listener, sender, age_s) - settings.rx_variance_m2
     innovation = _innovation_m(s, cycles, expected_m + s.x[where.mesh + listener])
-    _use_phase(s, where.mesh + listener, i.mesh, innovation, variance)
+    is_slow = s.status.recent_square < square(s.tuning.phase_slow_mps)
+    _use_phase(s, where.mesh + listener, i.mesh, innovation, variance, is_slow)
 
 
 def _whole_cycles(s: State, ticks: Ticks) -> float:
@@ -113,15 +120,21 @@ def _innovation_m(s: State, cycles: float, expected_m: float) -> float:
     return (off - floor(off + 0.5)) * _wavelength_m(s)
 
 
-def _use_phase(s: State, state: int, one: Ambiguity, innovation: float, variance: float) -> int:
-    """Process the phase in ``h``, whose last term is its ambiguity, the state of that index."""
+def _use_phase(s: State, state: int, one: Ambiguity, innovation: float, variance: float, may_be_several: bool) -> int:
+    """Process the phase in ``h``, whose last term is its ambiguity, the state of that index.
+
+    ``may_be_several``: whether it may be taken at several cycles.
+    """
     status = s.status
     predicted = compute_ph(s)
     one.ticks = status.epoch_ticks
-    if not one.is_known or predicted > _certain_m2(s):
+    is_certain, within_m2 = predicted <= _certain_m2(s), square(s.settings.gate) * (predicted + variance)
+    if is_certain:
+        within_m2 = _limit_m2(s, predicted + variance)
+    if not one.is_known or not (is_certain or (may_be_several and _are_few(s, within_m2))):
         _open(s, state, one, innovation, variance)
         return PHASE_BEGINS
-    if square(innovation) > _limit_m2(s, predicted + variance):
+    if not take_cycles(s, innovation, predicted + variance, sqrt(within_m2), _wavelength_m(s)):
         status.phases_refused += 1
         one.refused_in_row += 1
         if one.refused_in_row >= int(s.tuning.phases_in_row):
@@ -129,9 +142,13 @@ def _use_phase(s: State, state: int, one: Ambiguity, innovation: float, variance
         return PHASE_REFUSED
     one.refused_in_row = 0
     status.phases_used += 1
-    compute_fault_input(s, -1)
-    update(s, innovation, predicted + variance)
     return PHASE_USED
+
+
+def _are_few(s: State, within_m2: float) -> bool:
+    """Whether the cycles within a distance are few enough, and phases so reliable, that hypotheses are of use."""
+    is_short = 4.0 * within_m2 < square(s.tuning.most_cycles * _wavelength_m(s))
+    return is_short and are_phases_reliable(s)
 
 
 def _limit_m2(s: State, variance: float) -> float:
@@ -141,6 +158,15 @@ def _limit_m2(s: State, variance: float) -> float:
     if odds > 1e-6:
         gate_squared = min(gate_squared, -2.0 * log(odds))
     return min(gate_squared * variance, square(s.tuning.phase_gate * _wavelength_m(s)))
+
+
+def _count_wild(s: State, variance: float) -> None:
+    """Update the share of wild phases by how likely the newest is one: all phases are then equally likely."""
+    status, tuning = s.status, s.tuning
+    share = max(status.wild_share, tuning.least_wild)
+    wild = share * sqrt(_TWO_PI * variance) / _wavelength_m(s)
+    is_wild = wild / (wild + (1.0 - share) * s.hypotheses.fit)
+    status.wild_share += tuning.slow_forgetting * (is_wild - status.wild_share)
 
 
 def _learn_noise(s: State, shown_m2: float) -> None:
@@ -156,16 +182,28 @@ def _learn_noise(s: State, shown_m2: float) -> None:
 def _may_count(s: State) -> bool:
     """Whether the tag's phases may be used: neither just after the start nor while stamps contradict the state."""
     status, tuning = s.status, s.tuning
-    if status.mean_nis > tuning.wrong_nis:
+    settle_hypotheses(s)
+    if not are_phases_reliable(s):
+        give_up_hypotheses(s)
+    if status.mean_nis > tuning.wrong_nis or _stay_apart(s):
         close_phases(s)
     is_settled = (status.epoch_ticks - status.start_ticks) * TICK_S >= tuning.new_start_s
     return is_settled and status.mean_nis <= tuning.wrong_nis
 
 
+def _stay_apart(s: State) -> bool:
+    """Whether the positions of hypotheses differ by more than stamps err."""
+    apart_m2 = 0.0
+    for axis in range(s.dim):
+        apart_m2 += scatter(s, axis, axis)
+    return apart_m2 > square(s.tuning.apart_m)
+
+
 def close_phases(s: State) -> None:
     """Restart all ambiguities of the tag's receptions, which may be wrong by cycles."""
+    give_up_hypotheses(s)
     for anchor in range(s.count):
-        s.anchors[anchor].own.is_known = s.anchors[anchor].has_former = False
+        s.anchors[anchor].own.is_known = False
 
 
 def _measure_way(s: State) -> None:
@@ -197,8 +235,6 @@ def _follow_line(s: State) -> None:
     for anchor in range(s.count):
         if s.anchors[anchor].own.is_known:
             _turn(s, anchor, s.layout.ambiguity + anchor)
-        if s.anchors[anchor].has_former:
-            _turn(s, anchor, s.layout.former + anchor)
     for axis in range(s.dim):
         s.status.line_m[axis] = s.x[axis]
 
@@ -260,50 +296,6 @@ def _open(s: State, state: int, one: Ambiguity, innovation: float, variance: flo
     s.x[state] = ambiguity_m
 
 
-# Resolving the cycles lost in a gap
-
-
-def _keep_former(s: State, anchor: int) -> None:
-    """Keep an ambiguity that ends, unless a recent one is kept already."""
-    a, former, ambiguity = s.anchors[anchor], s.layout.former + anchor, s.layout.ambiguity + anchor
-    if a.has_former and _former_age_s(s, anchor) < s.tuning.phase_former_s:
-        return
-    a.has_former, a.former_ticks = True, s.status.epoch_ticks
-    s.x[former] = s.x[ambiguity]
-    for state in range(s.n):
-        set_covariance(s, former, state, s.P[at(ambiguity, state)])
-    s.P[at(former, former)] = s.P[at(ambiguity, ambiguity)]
-    for fault in range(s.rows):
-        s.V[former][fault] = s.V[ambiguity][fault]
-
-
-def _former_age_s(s: State, anchor: int) -> float:
-    return (s.status.epoch_ticks - s.anchors[anchor].former_ticks) * TICK_S
-
-
-def _rejoin(s: State, anchor: int) -> None:
-    """Equate an ambiguity and its former one up to whole cycles, once their number is certain.
-
-    Receptions after a gap show how clocks and tag have moved within it.
-    """
-    a = s.anchors[anchor]
-    if _former_age_s(s, anchor) > s.tuning.phase_former_s:
-        a.has_former = False
-        return
-    s.terms = 0
-    add_term(s, s.layout.ambiguity + anchor, 1.0)
-    add_term(s, s.layout.former + anchor, -1.0)
-    predicted, variance = compute_ph(s), s.status.phase_variance_m2
-    if predicted > _certain_m2(s):
-        return
-    innovation = _innovation_m(s, 0.0, h_dot_x(s, 0))
-    a.has_former = False
-    if square(innovation) <= _limit_m2(s, predicted + variance):
-        s.status.phases_rejoined += 1
-        compute_fault_input(s, -1)
-        update(s, innovation, predicted + variance)
-
-
 # Covariance analysis
 
 
@@ -317,7 +309,13 @@ def known_phase(s: State, anchor: int, walked_m: float) -> None:
         s.status.line_m[axis] = s.x[axis]
     s.P[at(ambiguity, ambiguity)] += s.settings.phase_wander * walked_m
     _phase_terms(s, anchor)
-    _use_phase(s, ambiguity, s.anchors[anchor].own, 0.0, s.status.phase_variance_m2)
+    own, variance = s.anchors[anchor].own, s.status.phase_variance_m2
+    predicted = compute_ph(s)
+    if own.is_known:
+        compute_fault_input(s, -1)
+        update(s, 0.0, predicted + variance)
+    else:
+        _open(s, ambiguity, own, 0.0, variance)
 
 
 def expected_phase(s: State, anchor: int) -> float:

@@ -4,7 +4,8 @@ from typing import Annotated, Final
 
 from skyless.core.air.frame import HEARD_BYTES, PHASE_STEPS, SHORT_BITS, two_bytes, unsigned
 from skyless.core.estimator.faults import fade_faults, open_faults
-from skyless.core.estimator.kalman import finish_updates, is_stationary, predict
+from skyless.core.estimator.hypotheses import scatter, settle_hypotheses
+from skyless.core.estimator.kalman import finish_updates, follows_cycles, is_stationary, predict
 from skyless.core.estimator.levels import fit_plane, integrity_state, largest_test, protect
 from skyless.core.estimator.measurements import (
     CLOCK_JUMPED,
@@ -18,7 +19,7 @@ from skyless.core.estimator.measurements import (
     report,
     zero_velocity,
 )
-from skyless.core.estimator.monitor import covariance_scale, update_stationary
+from skyless.core.estimator.monitor import motion_covariance, update_stationary
 from skyless.core.estimator.motion import fill_orientation, look_at_sensor, move
 from skyless.core.estimator.phases import close_phases, own_phase, relay_phase
 from skyless.core.estimator.state import (
@@ -30,7 +31,7 @@ from skyless.core.estimator.state import (
     find_anchor,
     remove_anchor,
 )
-from skyless.core.fix import POSITION, PROTECTION, QUALITY, VELOCITY
+from skyless.core.fix import ORIENTATION, POSITION, PROTECTION, QUALITY, VELOCITY
 from skyless.core.integrity import HPL, STATE, VPL
 from skyless.core.native.records import (
     MAX_ANCHORS,
@@ -252,6 +253,8 @@ def _process_of(s: State, anchor: int, packet: Packet, relays: Relays) -> int:
             master = find_anchor(s, packet.master)
             if master >= 0 and master != anchor:
                 report(s, anchor, master, packet.subticks, packet.report_variance_m2)
+    if PHASE_STATES > 0:
+        settle_hypotheses(s)
     _check_motion_and_faults(s, elapsed_s)
     return outcome
 
@@ -341,17 +344,19 @@ def _check_motion_and_faults(s: State, elapsed_s: float) -> None:
 
 def fill_fix(s: State) -> None:
     """Fill the rows of a fix."""
-    velocity, scale = s.layout.velocity, covariance_scale(s)
+    velocity = s.layout.velocity
     for one in range(s.dim):
         s.fix[POSITION][one] = s.x[one]
         s.fix[VELOCITY][one] = s.x[velocity + one]
         for other in range(s.dim):
-            s.fix[POSITION + 1 + one][other] = scale * s.P[at(one, other)]
-            s.fix[VELOCITY + 1 + one][other] = scale * s.P[at(velocity + one, velocity + other)]
+            s.fix[POSITION + 1 + one][other] = motion_covariance(s, one, other)
+            s.fix[VELOCITY + 1 + one][other] = motion_covariance(s, velocity + one, velocity + other)
     if s.dim == 2:
         s.fix[POSITION][2] = s.settings.height_m
     if MOTION_STATES > 0:
         fill_orientation(s)
+    if PHASE_STATES > 0:
+        s.fix[ORIENTATION + 1][2] = max(s.hypotheses.count, 1) if follows_cycles(s) else 0
     protect(s)
     s.fix[QUALITY][0] = s.status.mean_nis
     s.fix[QUALITY][1] = s.status.mean_square_m2
@@ -469,7 +474,7 @@ def _fill_row(s: State, row: BatchRow, has_levels: bool) -> None:
         row.position_m[one] = s.x[one]
         row.velocity_mps[one] = s.x[s.layout.velocity + one]
         for other in range(s.dim):
-            row.covariance_m2[one][other] = s.P[at(one, other)]
+            row.covariance_m2[one][other] = s.P[at(one, other)] + scatter(s, one, other)
     if has_levels:
         protect(s)
         for level in range(LEVELS):

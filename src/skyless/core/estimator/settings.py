@@ -30,6 +30,12 @@ class Tuning(Record):
     """… and its factor with every other innovation."""
     common: float = 1.5
     """If the normalised innovations of all anchors are beyond this on one side, the tag's clock has left its rate."""
+    rate_s: float = 0.5
+    """Time over which rates of clocks are compared, while phases are in use, to learn how little they wander [s] …"""
+    rate_changes: float = 20
+    """… the number of changes remembered …"""
+    least_walk_scale: float = 0.02
+    """… and the smallest factor on that of the settings."""
     relays_in_row: float = 8
     """Consecutive relays of a pair beyond the gate that show that its path has jumped; fewer may be late."""
     steady_walk_scale: float = 4.0
@@ -291,8 +297,22 @@ class Tuning(Record):
     """Largest standard deviation of a prediction that determines the cycle, as a fraction of a wavelength."""
     phase_step_m: float = 0.02
     """Length of the steps by which reflections change phases [m]."""
-    phase_former_s: float = 0.5
-    """Time for which an ambiguity from before a gap is kept, to resolve the cycles lost in it [s]."""
+    most_cycles: float = 3.0
+    """Number of cycles within the gate beyond which hypotheses on them are of no use."""
+    least_wild: float = 0.002
+    """Share of wild phases that is expected at least, so that they can be found."""
+    most_wild: float = 0.01
+    """Share beyond which hypotheses on cycles are misleading."""
+    phase_slow_mps: float = 1.4
+    """Speed beyond which relayed phases are not taken at several cycles: the tag's own need all hypotheses [m/s]."""
+    unlikely_log_odds: float = 14.0
+    """Logarithm of the odds against a hypothesis beyond which it is dropped."""
+    apart_m: float = 0.03
+    """Standard deviation of the positions of hypotheses beyond which they are given up [m]."""
+    phase_walking_mps: float = 0.7
+    """The same as ``walking_mps`` while phases may be taken at several cycles [m/s] …"""
+    speed_memory_s: float = 1.0
+    """… for the largest speed within this time [s]."""
     phases_in_row: float = 4
     """Consecutive phases of an anchor beyond the gate at which its ambiguity restarts."""
 

@@ -8,7 +8,6 @@ The state vector, all clocks against the tag's own counter, in metres and m/s:
     tx noises   of each anchor's newest TX stamp, common to all who received it
     ambiguities for each anchor what its carrier phase shows beyond range and offset, once phases are in use
     meshes      for each anchor the ambiguity of its own receptions of its partner, another anchor
-    formers     for each anchor its ambiguity before a gap, while the number of cycles lost in it is unknown
     changes     for each anchor the part of the range error that changes as the tag moves
     constants   the part that stays
     slope       growth of ranges with distance
@@ -36,6 +35,7 @@ from skyless.core.fix import PROTECTED_ROWS
 from skyless.core.integrity import limits_of
 from skyless.core.native.arithmetic import square
 from skyless.core.native.records import (
+    HYPOTHESES,
     MAX_ANCHORS,
     MOST_WAITING,
     MOTION_STATES,
@@ -78,7 +78,7 @@ LASTING, RECENT, CREEPING = range(3)
 """Kinds of faults: since the anchor joined, since its last few packets, or growing for seconds."""
 FAULT_KINDS: Final = 3
 FAULTS: Final = FAULT_KINDS * MAX_ANCHORS
-SENSITIVITIES: Final = FAULTS + PLANNED_FAULTS
+SENSITIVITIES: Final = FAULTS + PLANNED_FAULTS + HYPOTHESES
 """Capacity for columns of V."""
 WORK_ROWS: Final = MAX_ANCHORS + 1 + 2 * AXES
 
@@ -157,13 +157,40 @@ class Anchor(Record):
     """Ambiguity of the tag's receptions of it."""
     mesh: Ambiguity
     """Ambiguity of its receptions of its partner."""
+    rate_offset_ticks: Ticks
+    """Its offset when rates of clocks were compared …"""
+    rate_offset_m: float
+    """… and the rest of it."""
+    mean_rate_mps: float
+    """Its mean rate from the comparison before."""
+    rates: int
+    """Consecutive comparisons that it took part in."""
     partner: int
     """Identifier of the partner, −1 if none."""
-    has_former: bool
-    former_ticks: Ticks
-    """Tag time of the end of its former ambiguity."""
     phase_way_m: float
     """``Status.way_m`` at its newest phase."""
+
+
+@record
+class Hypotheses(Record):
+    """Hypotheses on the cycles of phases (``hypotheses``); their deviations from x are columns of V behind the faults.
+
+    Arrays have one element more than is used, as there may be no hypotheses at all.
+    """
+
+    count: int
+    """0 if all cycles are certain."""
+    fit: float
+    """Likelihood of the newest phase, of 1 for an innovation of zero."""
+    weight: Annotated[Reals, HYPOTHESES + 1]
+    log_weight: Annotated[Reals, HYPOTHESES + 1]
+    """Logarithms of the present weights, up to a constant; ``weight`` is as of the newest mean."""
+    found: int
+    """Number of hypotheses that follow from these by a phase, the most likely first, and what each consists of."""
+    new_log_weight: Annotated[Reals, HYPOTHESES + 1]
+    parent: Annotated[Integers, HYPOTHESES + 1]
+    shift_m: Annotated[Reals, HYPOTHESES + 1]
+    old: Annotated[Reals, HYPOTHESES + 1]
 
 
 @record
@@ -332,6 +359,17 @@ class Status(Record):
     """Normal of that plane."""
     has_phases: bool
     """Whether phases are in use, so that there are ambiguities."""
+    rate_ticks: Ticks
+    """Tag time at which rates of clocks were compared."""
+    rate_s: float
+    """Time from the comparison before."""
+    rate_changes: Count
+    anchors_walk: float
+    """Random walk of the anchors' clocks by changes of their rates [m²/s³]."""
+    tag_walk: float
+    """The same of the tag's."""
+    recent_square: float
+    """Square of the largest speed of late, with a memory of ``speed_memory_s``, while phases are in use."""
     line_m: Annotated[Reals, AXES]
     """Point at which phases are linearised: a position of the tag, moved from then on by its velocity alone."""
     step_m: Annotated[Reals, AXES]
@@ -345,9 +383,7 @@ class Status(Record):
     phases_used: Count
     phases_refused: Count
     phases_opened: Count
-    """Ambiguities that began or restarted …"""
-    phases_rejoined: Count
-    """… and those of them whose number of lost cycles was resolved afterwards."""
+    """Ambiguities that began or restarted."""
     has_open_ranges: bool
     """Whether anchors join with range errors beyond those of the settings."""
     range_errors: int
@@ -370,8 +406,7 @@ class Layout(Record):
     """These two exist only with a motion sensor; without, they equal ``ambiguity`` and are not used."""
     ambiguity: int
     mesh: int
-    former: int
-    """The last three exist only with phases; without, they equal ``change`` and are not used."""
+    """The last two exist only with phases; without, they equal ``change`` and are not used."""
     change: int
     constant: int
     slope: int
@@ -393,7 +428,7 @@ class State(Record):
     """Row by row, symmetric to the bit; see ``at``."""
     V: Annotated[Matrix, STATES, SENSITIVITIES]
     """Sensitivity of x to faults: for each kind to each metre by which an anchor is received late, then to faults added
-    by planning."""
+    by planning; or the deviations of hypotheses on cycles."""
     settings: EstimatorSettings
     tuning: Tuning
     horizontal_k: float
@@ -412,6 +447,7 @@ class State(Record):
     layout: Layout
     status: Status
     motion: Motion
+    hypotheses: Hypotheses
     information: Annotated[Matrix, FAULTS, FAULTS]
     """Information of the innovations on all faults, M; lower triangle."""
     evidence: Annotated[Reals, FAULTS]
@@ -521,7 +557,7 @@ def _clear(s: State) -> None:
     for row in range(PROTECTED_ROWS):
         for axis in range(AXES):
             s.fix[row][axis] = 0.0
-    s.count = s.waiting = 0
+    s.count = s.waiting = s.hypotheses.count = 0
 
 
 def prepare(s: State) -> None:
@@ -562,15 +598,14 @@ def set_layout(s: State) -> None:
     where.ambiguity = where.acceleration + (dim if s.motion.has_states else 0)
     ambiguities = count if s.status.has_phases else 0
     where.mesh = where.ambiguity + ambiguities
-    where.former = where.mesh + ambiguities
-    where.change = where.former + ambiguities
+    where.change = where.mesh + ambiguities
     where.constant = where.change + count
     where.slope = where.constant + count
     where.height = where.slope + 1 if dim == 2 else 2
     where.zero = where.slope if dim == 2 else where.slope + 1
     where.survey = where.slope + 2
     where.end = where.survey + dim * count
-    s.rows = FAULT_KINDS * count
+    s.rows = FAULT_KINDS * count + s.hypotheses.count
     make_uncertain(s, s.status.range_errors)
 
 
@@ -610,7 +645,6 @@ def add_anchor(s: State, identifier: int, position_m: Reals, std_m: float, is_op
     _insert_state(s, where.constant)
     if s.status.has_phases:
         _insert_state(s, where.change)
-        _insert_state(s, where.former)
         _insert_state(s, where.mesh)
     _insert_state(s, where.heading)
     _insert_state(s, where.tx_noise)
@@ -652,7 +686,7 @@ def add_anchor(s: State, identifier: int, position_m: Reals, std_m: float, is_op
 def use_phases(s: State) -> None:
     """Add ambiguities for all anchors, none of them known yet."""
     if not s.status.has_phases:
-        for _ in range(3 * s.count):
+        for _ in range(2 * s.count):
             _insert_state(s, s.layout.change)
         s.status.has_phases = True
         set_layout(s)
@@ -700,7 +734,6 @@ def remove_anchor(s: State, anchor: int) -> None:
     _remove_state(s, where.constant + anchor)
     _remove_state(s, where.change + anchor)
     if s.status.has_phases:
-        _remove_state(s, where.former + anchor)
         _remove_state(s, where.mesh + anchor)
         _remove_state(s, where.ambiguity + anchor)
     _remove_state(s, where.tx_noise + anchor)

@@ -12,6 +12,7 @@ are divided by the share, and those of relays by the share of all three packets 
 
 from typing import Annotated, Final
 
+from skyless.core.estimator.hypotheses import scatter
 from skyless.core.estimator.kalman import (
     compute_fault_input,
     compute_ph,
@@ -140,8 +141,8 @@ def find_walked(
 
     ``found`` holds the fixes and variances of the last superframe. A state with phases gets one for each message of
     which at least half arrive; the phases are as predicted, so cycles are ambiguous wherever they are for the filter.
+    Messages must not be late.
     """
-    s.rows = _walls(s) + 1
     superframe: Ticks = 0
     for one in range(count):
         superframe += messages[one].gap_ticks
@@ -190,10 +191,11 @@ def _add_fix(s: State, share: float, found: SteadyState) -> None:
     """Add a fix to the sums."""
     found.fixes += share
     for axis in range(s.dim):
-        found.variance_m2[axis] += share * s.P[at(axis, axis)]
-        found.square_bias_m2 += share * square(s.V[axis][_walls(s)])
-        for row in range(_walls(s) + 1, s.rows):
-            found.motion_m2[axis] += share * square(s.V[axis][row])
+        found.variance_m2[axis] += share * (s.P[at(axis, axis)] + scatter(s, axis, axis))
+        if not s.status.has_phases:  # with phases these columns are hypotheses
+            found.square_bias_m2 += share * square(s.V[axis][_walls(s)])
+            for row in range(_walls(s) + 1, s.rows):
+                found.motion_m2[axis] += share * square(s.V[axis][row])
 
 
 def _predict_with_impulses(s: State, now: Ticks, impulses_ticks: Ticks, superframe: Ticks) -> None:

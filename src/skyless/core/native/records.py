@@ -163,8 +163,10 @@ PACKETS_KEPT: Final = 16
 """Packets kept of each anchor for later relays; divides the range of sequence numbers."""
 MAX_RELAYS: Final = 32
 """Most relays with a packet; 13 fit into a frame."""
-PHASE_STATES: Final = 3
+PHASE_STATES: Final = 2
 """States of each anchor for carrier phases; 0 if they are not used."""
+HYPOTHESES: Final = 16
+"""Most hypotheses on cycles of phases; 0 if phases are not used."""
 MOTION_STATES: Final = 5
 """States for a motion sensor; 0 if none can be used."""
 PLANNED_FAULTS: Final = 13

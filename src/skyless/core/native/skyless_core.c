@@ -7,6 +7,7 @@
  * skyless.core.air.site_choice
  * skyless.core.air.site_pages
  * skyless.core.estimator.faults
+ * skyless.core.estimator.hypotheses
  * skyless.core.estimator.kalman
  * skyless.core.estimator.levels
  * skyless.core.estimator.measurements
@@ -175,6 +176,9 @@ INTERNAL void weigh_zero(State *s, int32_t anchor, real weight);
 INTERNAL void predict(State *s, int64_t rx_ticks);
 INTERNAL real speed_squared(State *s);
 INTERNAL real motion_noise(State *s);
+INTERNAL bool has_phase(State *s, int32_t anchor);
+INTERNAL bool follows_cycles(State *s);
+INTERNAL bool are_phases_reliable(State *s);
 INTERNAL real unseen_noise(State *s);
 INTERNAL bool is_stationary(State *s);
 INTERNAL void advance(State *s, real dt);
@@ -220,6 +224,13 @@ INTERNAL bool relays_contradict(State *s);
 INTERNAL bool relays_fit(State *s);
 INTERNAL real horizontal_variance_m2(State *s, real ahead_s);
 INTERNAL bool fits_settings(State *s);
+INTERNAL bool take_cycles(State *s, real innovation, real variance, real limit_m, real cycle_m);
+INTERNAL void keep_likely(State *s, int32_t parent, real shift_m, real log_weight);
+INTERNAL void replace(State *s, real inverse);
+INTERNAL void settle_hypotheses(State *s);
+INTERNAL void set_count(State *s, int32_t count);
+INTERNAL real scatter(State *s, int32_t state, int32_t other);
+INTERNAL void give_up_hypotheses(State *s);
 INTERNAL bool is_warm(State *s);
 INTERNAL void note_outlier(State *s, int32_t anchor, real innovation, real innovation_variance);
 INTERNAL bool has_jumped(State *s, int32_t anchor);
@@ -227,7 +238,7 @@ INTERNAL bool is_common(State *s, real normalised);
 INTERNAL bool is_of_clock(State *s, int32_t anchor, real innovation);
 INTERNAL void open_range_error(State *s, int32_t anchor, real innovation);
 INTERNAL void adapt_change_noise(State *s, int32_t anchor, real normalised);
-INTERNAL real adapted(State *s, real scale, bool is_too_small, real largest);
+INTERNAL real adapted(State *s, real scale, bool is_too_small, real least, real largest);
 INTERNAL bool is_off_zero(State *s, real mean);
 INTERNAL void end_small_obstruction(State *s, int32_t anchor);
 INTERNAL void note_innovation(State *s, real innovation, real innovation_variance, bool is_difference);
@@ -238,7 +249,10 @@ INTERNAL void learn_place(State *s, int32_t anchor, real residual_m);
 INTERNAL void update_stationary(State *s, real dt);
 INTERNAL void adapt_process_noise(State *s, real normalised);
 INTERNAL void adapt_clock_noise(State *s, int32_t anchor, real normalised);
+INTERNAL real least_scale(State *s, real walk);
+INTERNAL void learn_least_walk(State *s);
 INTERNAL real covariance_scale(State *s);
+INTERNAL real motion_covariance(State *s, int32_t state, int32_t other);
 INTERNAL void protect(State *s);
 INTERNAL real largest_test(State *s);
 INTERNAL void find_least_axis(State *s, int32_t dim);
@@ -310,10 +324,14 @@ INTERNAL real whole_cycles(State *s, int64_t ticks);
 INTERNAL real wavelength_m(State *s);
 INTERNAL real certain_m2(State *s);
 INTERNAL real innovation_m(State *s, real cycles, real expected_m);
-INTERNAL int32_t use_phase(State *s, int32_t state, Ambiguity *one, real innovation, real variance);
+INTERNAL int32_t use_phase(State *s, int32_t state, Ambiguity *one, real innovation, real variance, bool
+        may_be_several);
+INTERNAL bool are_few(State *s, real within_m2);
 INTERNAL real limit_m2(State *s, real variance);
+INTERNAL void count_wild(State *s, real variance);
 INTERNAL void learn_noise(State *s, real shown_m2);
 INTERNAL bool may_count(State *s);
+INTERNAL bool stay_apart(State *s);
 INTERNAL void close_phases(State *s);
 INTERNAL void measure_way(State *s);
 INTERNAL void follow_line(State *s);
@@ -322,9 +340,6 @@ INTERNAL void subtract(State *s, int32_t state, int32_t other, real weight);
 INTERNAL real line_range_m(State *s, int32_t anchor, real *point_m);
 INTERNAL real phase_terms(State *s, int32_t anchor);
 INTERNAL void open(State *s, int32_t state, Ambiguity *one, real innovation, real variance);
-INTERNAL void keep_former(State *s, int32_t anchor);
-INTERNAL real former_age_s(State *s, int32_t anchor);
-INTERNAL void rejoin(State *s, int32_t anchor);
 INTERNAL void known_phase(State *s, int32_t anchor, real walked_m);
 INTERNAL real expected_phase(State *s, int32_t anchor);
 INTERNAL int32_t process(State *s, Packet *packet, Relays *relays);
@@ -1569,7 +1584,6 @@ INTERNAL real vertical_limit(real risk) {
  *     tx noises   of each anchor's newest TX stamp, common to all who received it
  *     ambiguities for each anchor what its carrier phase shows beyond range and offset, once phases are in use
  *     meshes      for each anchor the ambiguity of its own receptions of its partner, another anchor
- *     formers     for each anchor its ambiguity before a gap, while the number of cycles lost in it is unknown
  *     changes     for each anchor the part of the range error that changes as the tag moves
  *     constants   the part that stays
  *     slope       growth of ranges with distance
@@ -1665,6 +1679,7 @@ INTERNAL void clear(State *s) {
             s->fix[row][axis] = REAL(0.0);
         }
     }
+    s->hypotheses.count = 0;
     s->waiting = 0;
     s->count = 0;
 }
@@ -1719,15 +1734,14 @@ INTERNAL void set_layout(State *s) {
     where->ambiguity = where->acceleration + (s->motion.has_states ? dim : 0);
     int32_t ambiguities = s->status.has_phases ? count : 0;
     where->mesh = where->ambiguity + ambiguities;
-    where->former = where->mesh + ambiguities;
-    where->change = where->former + ambiguities;
+    where->change = where->mesh + ambiguities;
     where->constant = where->change + count;
     where->slope = where->constant + count;
     where->height = dim == 2 ? where->slope + 1 : 2;
     where->zero = dim == 2 ? where->slope : where->slope + 1;
     where->survey = where->slope + 2;
     where->end = where->survey + dim * count;
-    s->rows = FAULT_KINDS * count;
+    s->rows = FAULT_KINDS * count + s->hypotheses.count;
     make_uncertain(s, s->status.range_errors);
 }
 
@@ -1773,7 +1787,6 @@ SKYLESS_EXPORT int32_t skyless_add_anchor(State *s, int32_t identifier, real *po
     insert_state(s, where->constant);
     if (s->status.has_phases) {
         insert_state(s, where->change);
-        insert_state(s, where->former);
         insert_state(s, where->mesh);
     }
     insert_state(s, where->heading);
@@ -1827,7 +1840,7 @@ SKYLESS_EXPORT int32_t skyless_add_anchor(State *s, int32_t identifier, real *po
 /* Add ambiguities for all anchors, none of them known yet. */
 INTERNAL void use_phases(State *s) {
     if (!s->status.has_phases) {
-        for (int32_t time_1 = 0, time_1_end = 3 * s->count; time_1 < time_1_end; time_1++) {
+        for (int32_t time_1 = 0, time_1_end = 2 * s->count; time_1 < time_1_end; time_1++) {
             insert_state(s, s->layout.change);
         }
         s->status.has_phases = true;
@@ -1886,7 +1899,6 @@ INTERNAL void remove_anchor(State *s, int32_t anchor) {
     remove_state(s, where->constant + anchor);
     remove_state(s, where->change + anchor);
     if (s->status.has_phases) {
-        remove_state(s, where->former + anchor);
         remove_state(s, where->mesh + anchor);
         remove_state(s, where->ambiguity + anchor);
     }
@@ -2113,6 +2125,10 @@ INTERNAL void predict(State *s, int64_t rx_ticks) {
     for (int32_t axis = 0, axis_end = s->dim; axis < axis_end; axis++) {
         status->line_m[axis] += s->x[where->velocity + axis] * dt;
     }
+    if (status->has_phases) {
+        status->recent_square = max_real(status->recent_square * exp_(-dt / s->tuning.speed_memory_s),
+                speed_squared(s));
+    }
     advance(s, dt);
     real motion = motion_noise(s);
     real white_m2 = settings->white * dt;
@@ -2150,9 +2166,39 @@ INTERNAL real speed_squared(State *s) {
     return total;
 }
 
-/* Spectral density of the tag's acceleration, m²/s³: as innovations require, and what a fast tag's turns need. */
+/* Spectral density of the tag's acceleration, m²/s³: as innovations require, and what a fast tag's turns need.
+ *
+ * Hypotheses on cycles need it to be large beforehand: if it is too small, wrong cycles explain the motion. */
 INTERNAL real motion_noise(State *s) {
-    return s->settings.qa * max_real(s->status.q_scale, speed_squared(s) / square(s->tuning.walking_mps));
+    Tuning *tuning = &s->tuning;
+    Status *status = &s->status;
+    real least = speed_squared(s) / square(s->tuning.walking_mps);
+    if (are_phases_reliable(s)) {
+        least = status->recent_square / square(tuning->phase_walking_mps);
+    }
+    return s->settings.qa * max_real(status->q_scale, least);
+}
+
+/* Whether an anchor's phases are in use: its ambiguity is confirmed, and phases are not being rejected. */
+INTERNAL bool has_phase(State *s, int32_t anchor) {
+    Ambiguity *own = &s->anchors[anchor].own;
+    return own->is_known && own->refused_in_row < truncated(s->tuning.phases_in_row) - 1;
+}
+
+/* Whether phases of enough anchors are in use to determine the tag's clock. */
+INTERNAL bool follows_cycles(State *s) {
+    int32_t found = 0;
+    for (int32_t anchor = 0, anchor_end = s->count; anchor < anchor_end; anchor++) {
+        if (has_phase(s, anchor)) {
+            found += 1;
+        }
+    }
+    return found > s->dim;
+}
+
+/* Whether phases are in use, are rarely wild, and range errors have not jumped of late: cycles may be uncertain. */
+INTERNAL bool are_phases_reliable(State *s) {
+    return s->status.has_phases && s->status.wild_share < s->tuning.most_wild && jump_share(s) < REAL(1.0);
 }
 
 /* The same of what a motion sensor does not show. */
@@ -2446,6 +2492,10 @@ INTERNAL void note_update(State *s, real innovation, real innovation_variance, r
     }
     for (int32_t fault = 0, fault_end = s->rows; fault < fault_end; fault++) {
         g[fault] *= step;
+    }
+    for (int32_t one = 0, one_end = s->hypotheses.count; one < one_end; one++) {
+        real off = innovation * inverse + g[FAULT_KINDS * s->count + one];
+        s->hypotheses.log_weight[one] -= REAL(0.5) * off * off;
     }
     step *= innovation;
     for (int32_t state = 0, state_end = s->used; state < state_end; state++) {
@@ -2936,6 +2986,180 @@ INTERNAL bool fits_settings(State *s) {
     return chi2 < s->tuning.fitting_chi2 * (real)count;
 }
 
+/* Cycles that phases may have, as hypotheses which share one covariance.
+ *
+ * A phase whose cycle is not certain is processed at each cycle that is possible. These updates have the same row h and
+ * the same variance. So the states that result have one P in common, and differ from their weighted mean, which is x, by a
+ * vector each. These deviations are columns of V behind those of the faults, and every time update and measurement update
+ * treats them as such: the innovation of a hypothesis is ν − h·deviation. Its weight is the likelihood of all stamps and
+ * phases since. An unlikely hypothesis is dropped, and only the most likely ones are kept.
+ *
+ * What is known of the tag is x with P plus the scatter of the hypotheses. */
+
+/* Process the phase in ``h`` at each cycle within a limit, for each hypothesis. Returns False if there is none.
+ *
+ * P·h is the next of ``U``; ``innovation`` is the mean's, at any cycle; ``variance``: of innovations; ``cycle_m``: the
+ * wavelength. No updates may be queued. */
+INTERNAL bool take_cycles(State *s, real innovation, real variance, real limit_m, real cycle_m) {
+    Hypotheses *hypotheses = &s->hypotheses;
+    int32_t first = FAULT_KINDS * s->count;
+    if (hypotheses->count == 0) {
+        hypotheses->log_weight[0] = REAL(0.0);
+        hypotheses->weight[0] = REAL(1.0);
+        set_count(s, 1);
+    }
+    compute_fault_input(s, -1);
+    hypotheses->found = 0;
+    hypotheses->fit = REAL(0.0);
+    for (int32_t parent = 0, parent_end = hypotheses->count; parent < parent_end; parent++) {
+        real off_m = innovation + s->G[0][first + parent];
+        for (int64_t cycle = -floor_real((limit_m + off_m) / cycle_m), cycle_end = floor_real((limit_m - off_m) /
+                cycle_m) + 1; cycle < cycle_end; cycle++) {
+            real shift_m = (real)cycle * cycle_m;
+            real likelihood = -REAL(0.5) * square(off_m + shift_m) / variance;
+            hypotheses->fit += hypotheses->weight[parent] * exp_(likelihood);
+            keep_likely(s, parent, shift_m, hypotheses->log_weight[parent] + likelihood);
+        }
+    }
+    if (hypotheses->found > 0) {
+        update(s, innovation, variance, REAL(1.0));
+        replace(s, REAL(1.0) / SQRT(variance));
+    }
+    settle_hypotheses(s);
+    return hypotheses->found > 0;
+}
+
+/* Keep a hypothesis that follows from another one by a cycle, if it is among the most likely ones, in order. */
+INTERNAL void keep_likely(State *s, int32_t parent, real shift_m, real log_weight) {
+    Hypotheses *hypotheses = &s->hypotheses;
+    if (hypotheses->found == HYPOTHESES && log_weight <= hypotheses->new_log_weight[HYPOTHESES - 1]) {
+        return;
+    }
+    int32_t place = min_32(hypotheses->found, HYPOTHESES - 1);
+    hypotheses->found = place + 1;
+    while (place > 0 && hypotheses->new_log_weight[place - 1] < log_weight) {
+        hypotheses->new_log_weight[place] = hypotheses->new_log_weight[place - 1];
+        hypotheses->parent[place] = hypotheses->parent[place - 1];
+        hypotheses->shift_m[place] = hypotheses->shift_m[place - 1];
+        place -= 1;
+    }
+    hypotheses->new_log_weight[place] = log_weight;
+    hypotheses->parent[place] = parent;
+    hypotheses->shift_m[place] = shift_m;
+}
+
+/* Replace all hypotheses by those found: a parent's deviation, and the gain times the shift by cycles.
+ *
+ * The first of ``U`` is P·h/√S of the phase, and ``inverse`` 1/√S. */
+INTERNAL void replace(State *s, real inverse) {
+    Hypotheses *hypotheses = &s->hypotheses;
+    int32_t first = FAULT_KINDS * s->count;
+    for (int32_t state = 0, state_end = s->used; state < state_end; state++) {
+        real *effects = s->V[state];
+        real gain = s->U[0][state] * inverse;
+        for (int32_t one = 0, one_end = hypotheses->count; one < one_end; one++) {
+            hypotheses->old[one] = effects[first + one];
+        }
+        for (int32_t one = 0, one_end = hypotheses->found; one < one_end; one++) {
+            effects[first + one] = hypotheses->old[hypotheses->parent[one]] + gain * hypotheses->shift_m[one];
+        }
+    }
+    for (int32_t one = 0, one_end = hypotheses->found; one < one_end; one++) {
+        hypotheses->log_weight[one] = hypotheses->new_log_weight[one];
+    }
+    set_count(s, hypotheses->found);
+}
+
+/* Drop unlikely hypotheses, and make x the mean of the others. No updates may be queued. */
+INTERNAL void settle_hypotheses(State *s) {
+    Hypotheses *hypotheses = &s->hypotheses;
+    int32_t first = FAULT_KINDS * s->count;
+    real total = REAL(0.0);
+    if (hypotheses->count == 0) {
+        return;
+    }
+    real largest = hypotheses->log_weight[0];
+    for (int32_t one = 1, one_end = hypotheses->count; one < one_end; one++) {
+        largest = max_real(largest, hypotheses->log_weight[one]);
+    }
+    for (int32_t one = 0, one_end = hypotheses->count; one < one_end; one++) {
+        hypotheses->log_weight[one] -= largest;
+        hypotheses->weight[one] = exp_(hypotheses->log_weight[one]);
+    }
+    for (int32_t one = hypotheses->count - 1; one > -1; one--) {
+        if (hypotheses->log_weight[one] < -s->tuning.unlikely_log_odds) {
+            int32_t last = hypotheses->count - 1;
+            hypotheses->log_weight[one] = hypotheses->log_weight[last];
+            hypotheses->weight[one] = hypotheses->weight[last];
+            for (int32_t state = 0, state_end = s->used; state < state_end; state++) {
+                s->V[state][first + one] = s->V[state][first + last];
+            }
+            set_count(s, last);
+        }
+    }
+    for (int32_t one = 0, one_end = hypotheses->count; one < one_end; one++) {
+        total += hypotheses->weight[one];
+    }
+    for (int32_t one = 0, one_end = hypotheses->count; one < one_end; one++) {
+        hypotheses->weight[one] /= total;
+    }
+    for (int32_t state = 0, state_end = s->used; state < state_end; state++) {
+        real *effects = s->V[state];
+        real mean = REAL(0.0);
+        for (int32_t one = 0, one_end = hypotheses->count; one < one_end; one++) {
+            mean += hypotheses->weight[one] * effects[first + one];
+        }
+        s->x[state] += mean;
+        for (int32_t one = 0, one_end = hypotheses->count; one < one_end; one++) {
+            effects[first + one] -= mean;
+        }
+    }
+    if (hypotheses->count == 1) {
+        set_count(s, 0);
+    }
+}
+
+/* Set the number of hypotheses; unused columns of V are zero. */
+INTERNAL void set_count(State *s, int32_t count) {
+    int32_t first = FAULT_KINDS * s->count;
+    for (int32_t state = 0, state_end = s->used; state < state_end; state++) {
+        for (int32_t one = count, one_end = s->hypotheses.count; one < one_end; one++) {
+            s->V[state][first + one] = REAL(0.0);
+        }
+    }
+    s->hypotheses.count = count;
+    s->rows = first + count;
+}
+
+/* Covariance of two states over the hypotheses. */
+INTERNAL real scatter(State *s, int32_t state, int32_t other) {
+    real total = REAL(0.0);
+    int32_t first = FAULT_KINDS * s->count;
+    for (int32_t one = 0, one_end = s->hypotheses.count; one < one_end; one++) {
+        total += s->hypotheses.weight[one] * s->V[state][first + one] * s->V[other][first + one];
+    }
+    return total;
+}
+
+/* Replace all hypotheses by their mean. P gains their scatter. */
+INTERNAL void give_up_hypotheses(State *s) {
+    Hypotheses *hypotheses = &s->hypotheses;
+    int32_t first = FAULT_KINDS * s->count;
+    if (hypotheses->count == 0) {
+        return;
+    }
+    for (int32_t state = 0, state_end = s->used; state < state_end; state++) {
+        int32_t row = row_of(state);
+        real *effects = s->V[state];
+        for (int32_t other = 0, other_end = row_end(state, s->n); other < other_end; other++) {
+            for (int32_t one = 0, one_end = hypotheses->count; one < one_end; one++) {
+                s->P[row + other] += hypotheses->weight[one] * effects[first + one] * s->V[other][first + one];
+            }
+        }
+    }
+    set_count(s, 0);
+}
+
 /* Which measurements are used, and how process noise adapts to innovations.
  *
  * Covered are
@@ -2984,12 +3208,17 @@ INTERNAL bool has_jumped(State *s, int32_t anchor) {
 
 /* Whether the newest innovations of all anchors but at most one small one are on the side of this innovation.
  *
- * The tag's clock is the cause then. A faulty anchor draws the others to the opposite side of its own. */
+ * The tag's clock is the cause then. A faulty anchor draws the others to the opposite side of its own. While phases
+ * determine the clock, stamps of all anchors may well err to one side. */
 INTERNAL bool is_common(State *s, real normalised) {
     int32_t others = 0;
+    real limit = follows_cycles(s) ? s->tuning.suspect : s->tuning.common;
+    if (abs_real(normalised) <= limit) {
+        return false;
+    }
     for (int32_t anchor = 0, anchor_end = s->count; anchor < anchor_end; anchor++) {
         real newest = s->anchors[anchor].innovation;
-        if (abs_real(newest) <= s->tuning.common) {
+        if (abs_real(newest) <= limit) {
             others += 1;
         } else if (newest * normalised <= REAL(0.0)) {
             others += 2;
@@ -3020,13 +3249,13 @@ INTERNAL void open_range_error(State *s, int32_t anchor, real innovation) {
 INTERNAL void adapt_change_noise(State *s, int32_t anchor, real normalised) {
     Anchor *a = &s->anchors[anchor];
     a->change_mean += s->tuning.mean_gain * (normalised - a->change_mean);
-    a->change_scale = adapted(s, a->change_scale, is_off_zero(s, a->change_mean), s->tuning.max_scale);
+    a->change_scale = adapted(s, a->change_scale, is_off_zero(s, a->change_mean), REAL(1.0), s->tuning.max_scale);
 }
 
 /* Factor on process noise after an innovation, which shows whether the noise is too small. */
-INTERNAL real adapted(State *s, real scale, bool is_too_small, real largest) {
+INTERNAL real adapted(State *s, real scale, bool is_too_small, real least, real largest) {
     scale *= is_too_small ? s->tuning.noise_growth : s->tuning.noise_loss;
-    return min_real(max_real(scale, REAL(1.0)), largest);
+    return min_real(max_real(scale, least), largest);
 }
 
 /* Whether a running mean of normalised innovations is farther from zero than chance explains. */
@@ -3194,18 +3423,71 @@ INTERNAL void adapt_process_noise(State *s, real normalised) {
     if (lag_square > tuning->sudden_lag) {
         status->q_scale = min_real(REAL(2.0) * status->q_scale, tuning->max_scale);
     } else {
-        status->q_scale = adapted(s, status->q_scale, status->lag_square > tuning->lag_limit, tuning->max_scale);
+        status->q_scale = adapted(s, status->q_scale, status->lag_square > tuning->lag_limit, REAL(1.0),
+                tuning->max_scale);
     }
     status->common_mean += gain * (normalised - status->common_mean);
-    bool is_clock_off = is_off_zero(s, status->common_mean);
-    status->walk_scale = adapted(s, status->walk_scale, is_clock_off, tuning->max_walk_scale);
+    bool is_clock_off = is_off_zero(s, status->common_mean) && !follows_cycles(s);
+    real least = max_real(least_scale(s, status->tag_walk), least_scale(s, status->anchors_walk));
+    status->walk_scale = adapted(s, status->walk_scale, is_clock_off, least, tuning->max_walk_scale);
 }
 
 /* Adapt the process noise of an anchor's clock to a relay's innovation. */
 INTERNAL void adapt_clock_noise(State *s, int32_t anchor, real normalised) {
     Anchor *a = &s->anchors[anchor];
     a->relay_mean += s->tuning.mean_gain * (normalised - a->relay_mean);
-    a->walk_scale = adapted(s, a->walk_scale, is_off_zero(s, a->relay_mean), s->tuning.max_walk_scale);
+    real least = least_scale(s, s->status.anchors_walk);
+    a->walk_scale = adapted(s, a->walk_scale, is_off_zero(s, a->relay_mean), least, s->tuning.max_walk_scale);
+}
+
+/* Factor on the settings' random walk of a clock below which it is not adapted, by what its rates have shown. */
+INTERNAL real least_scale(State *s, real walk) {
+    if (s->status.rate_changes < 2) {
+        return REAL(1.0);
+    }
+    return min_real(max_real(walk / s->settings.walk, s->tuning.least_walk_scale), s->tuning.max_walk_scale);
+}
+
+/* Learn how little the clocks wander, from the changes of their mean rates.
+ *
+ * From one interval τ to the next a rate changes with the variance 2/3·walk·τ; the stamps' noise only adds to it. The
+ * mean change of all offsets is the tag's clock, and the rest are the anchors'. */
+INTERNAL void learn_least_walk(State *s) {
+    Status *status = &s->status;
+    Tuning *tuning = &s->tuning;
+    real elapsed_s = (real)(status->epoch_ticks - status->rate_ticks) * TICK_S;
+    if (elapsed_s < tuning->rate_s) {
+        return;
+    }
+    bool is_long = elapsed_s > REAL(2.0) * tuning->rate_s;
+    int32_t found = 0;
+    real mean = REAL(0.0);
+    real square_sum = REAL(0.0);
+    for (int32_t anchor = 0, anchor_end = s->count; anchor < anchor_end; anchor++) {
+        Anchor *a = &s->anchors[anchor];
+        real offset_m = s->x[s->layout.offset + anchor];
+        real rate_mps = ((real)(a->offset_ticks - a->rate_offset_ticks) * TICK_M + (offset_m - a->rate_offset_m)) /
+                elapsed_s;
+        real change_mps = rate_mps - a->mean_rate_mps;
+        a->rate_offset_ticks = a->offset_ticks;
+        a->rate_offset_m = offset_m;
+        a->mean_rate_mps = rate_mps;
+        a->rates = is_long || !a->has_rate ? 1 : a->rates + 1;
+        if (a->rates > 2) {
+            found += 1;
+            square_sum += square(change_mps - mean) * (real)(found - 1) / (real)found;
+            mean += (change_mps - mean) / (real)found;
+        }
+    }
+    if (found > s->dim) {
+        real walk_s = REAL(3.0) / (elapsed_s + status->rate_s);
+        status->rate_changes += 1;
+        real gain = REAL(1.0) / (real)min_64(status->rate_changes, truncated(tuning->rate_changes));
+        status->tag_walk += gain * (square(mean) * walk_s - status->tag_walk);
+        status->anchors_walk += gain * (square_sum / (real)(found - 1) * walk_s - status->anchors_walk);
+    }
+    status->rate_ticks = status->epoch_ticks;
+    status->rate_s = elapsed_s;
 }
 
 /* Factor on the position's covariance while innovations are larger than expected.
@@ -3214,6 +3496,11 @@ INTERNAL void adapt_clock_noise(State *s, int32_t anchor, real normalised) {
 INTERNAL real covariance_scale(State *s) {
     real nis = s->status.mean_nis;
     return nis > s->tuning.wrong_nis ? nis * nis : REAL(1.0);
+}
+
+/* Covariance of two states of position or velocity, as a fix and its levels state it. */
+INTERNAL real motion_covariance(State *s, int32_t state, int32_t other) {
+    return covariance_scale(s) * s->P[at(state, other)] + scatter(s, state, other);
 }
 
 /* Protection levels: bounds on the position error even if receptions are late (``docs/maths.md`` section 8).
@@ -3230,7 +3517,6 @@ INTERNAL real covariance_scale(State *s) {
 /* Compute the levels in metres and the tests of faults. */
 INTERNAL void protect(State *s) {
     real *levels = s->levels;
-    real scale = covariance_scale(s);
     levels[VPL] = REAL(0.0);
     levels[HPL] = REAL(0.0);
     for (int32_t kind = 0; kind < FAULT_KINDS; kind++) {
@@ -3246,9 +3532,9 @@ INTERNAL void protect(State *s) {
         real shift_x = REAL(0.0);
         real shift_y = REAL(0.0);
         real shift_z = REAL(0.0);
-        real xx = scale * s->P[at(0, 0)];
-        real xy = scale * s->P[at(0, 1)];
-        real yy = scale * s->P[at(1, 1)];
+        real xx = motion_covariance(s, 0, 0);
+        real xy = motion_covariance(s, 0, 1);
+        real yy = motion_covariance(s, 1, 1);
         real zz = REAL(0.0);
         for (int32_t one = 0, one_end = s->count; one < one_end; one++) {
             shift_x += x[one] * faults[one];
@@ -3264,7 +3550,8 @@ INTERNAL void protect(State *s) {
         real largest = REAL(0.5) * (xx + yy) + SQRT(REAL(0.25) * square(xx - yy) + xy * xy);
         levels[HPL] = max_real(levels[HPL], hypot_(shift_x, shift_y) + s->horizontal_k * SQRT(largest));
         if (s->dim == 3) {
-            levels[VPL] = max_real(levels[VPL], abs_real(shift_z) + s->vertical_k * SQRT(scale * s->P[at(2, 2)] + zz));
+            levels[VPL] = max_real(levels[VPL], abs_real(shift_z) + s->vertical_k * SQRT(motion_covariance(s, 2, 2) +
+                    zz));
         }
     }
 }
@@ -3656,7 +3943,7 @@ INTERNAL int32_t own_reception(State *s, int32_t anchor, int64_t rx_ticks, int64
     if (!is_late_often(s)) {  /* late packets are no multipath */
         learn_place(s, anchor, innovation + s->x[where->change + anchor]);
     }
-    if (is_warm(s) && abs_real(a->innovation) > tuning->common && is_common(s, a->innovation)) {
+    if (is_warm(s) && is_common(s, a->innovation)) {
         status->walk_scale = tuning->max_walk_scale;
         a->outliers_in_row = 0;
     } else if (is_warm(s)) {
@@ -4724,8 +5011,9 @@ INTERNAL void measure_speed(State *s, real dt) {
  * anchors turn, and ranges known to millimetres up to a constant determine the position. ``docs/maths.md`` section 6.7.
  *
  * A wrong cycle in fast motion looks consistent and drags the position by metres. So a phase is used only together with a
- * stamp that was used, and only if it is predicted to a tenth of a wavelength; otherwise its ambiguity starts again, which
- * provides no information. If stamps contradict the state, all ambiguities start again. */
+ * stamp that was used. If it is not predicted to a tenth of a wavelength, it is taken at each cycle that is possible
+ * (``hypotheses``); where these are too many, or phases are often wrong, its ambiguity starts again, which provides no
+ * information. If stamps contradict the state, or the hypotheses stay apart, all ambiguities start again. */
 
 /* Process the phase, in [0, 1), of a reception of the tag's whose stamp was used. It falls as stamps grow. */
 INTERNAL void own_phase(State *s, int32_t anchor, real phase_cycles) {
@@ -4735,12 +5023,12 @@ INTERNAL void own_phase(State *s, int32_t anchor, real phase_cycles) {
     use_phases(s);
     finish_updates(s);
     if (!a->has_rate || !may_count(s)) {
-        a->has_former = false;
         a->own.is_known = false;
         return;
     }
     int32_t ambiguity = s->layout.ambiguity + anchor;
     measure_way(s);
+    learn_least_walk(s);
     if (a->own.is_known) {
         real wander = max_real(tuning->phase_wander * status->phase_variance_m2, s->settings.phase_wander);
         s->P[at(ambiguity, ambiguity)] += wander * (status->way_m - a->phase_way_m);
@@ -4752,18 +5040,12 @@ INTERNAL void own_phase(State *s, int32_t anchor, real phase_cycles) {
     real innovation = innovation_m(s, cycles, expected_m);
     real variance = status->phase_variance_m2;
     real predicted = compute_ph(s);
-    if (a->own.is_known && predicted > certain_m2(s)) {
-        keep_former(s, anchor);
+    int32_t outcome = use_phase(s, ambiguity, &a->own, innovation, variance, true);
+    if (outcome != PHASE_BEGINS) {
+        count_wild(s, predicted + variance);
     }
-    int32_t outcome = use_phase(s, ambiguity, &a->own, innovation, variance);
-    if (outcome == PHASE_REFUSED) {
-        status->wild_share += tuning->slow_forgetting * (REAL(1.0) - status->wild_share);
-    } else if (outcome == PHASE_USED) {
-        status->wild_share -= tuning->slow_forgetting * status->wild_share;
+    if (outcome == PHASE_USED && predicted <= certain_m2(s) && s->hypotheses.count == 0) {
         learn_noise(s, square(innovation) - predicted);
-        if (a->has_former) {
-            rejoin(s, anchor);
-        }
     }
 }
 
@@ -4792,7 +5074,8 @@ INTERNAL void relay_phase(State *s, int32_t listener, int32_t sender, int64_t pa
     real variance = square(s->tuning.phase_mesh_std_m) + relay_variance(s, listener, sender, age_s) -
             settings->rx_variance_m2;
     real innovation = innovation_m(s, cycles, expected_m + s->x[where->mesh + listener]);
-    use_phase(s, where->mesh + listener, &i->mesh, innovation, variance);
+    bool is_slow = s->status.recent_square < square(s->tuning.phase_slow_mps);
+    use_phase(s, where->mesh + listener, &i->mesh, innovation, variance, is_slow);
 }
 
 /* Fractional cycles, in [0, 1), of a number of ticks. */
@@ -4816,16 +5099,24 @@ INTERNAL real innovation_m(State *s, real cycles, real expected_m) {
     return (off - (real)floor_real(off + REAL(0.5))) * wavelength_m(s);
 }
 
-/* Process the phase in ``h``, whose last term is its ambiguity, the state of that index. */
-INTERNAL int32_t use_phase(State *s, int32_t state, Ambiguity *one, real innovation, real variance) {
+/* Process the phase in ``h``, whose last term is its ambiguity, the state of that index.
+ *
+ * ``may_be_several``: whether it may be taken at several cycles. */
+INTERNAL int32_t use_phase(State *s, int32_t state, Ambiguity *one, real innovation, real variance, bool may_be_several)
+        {
     Status *status = &s->status;
     real predicted = compute_ph(s);
     one->ticks = status->epoch_ticks;
-    if (!one->is_known || predicted > certain_m2(s)) {
+    bool is_certain = predicted <= certain_m2(s);
+    real within_m2 = square(s->settings.gate) * (predicted + variance);
+    if (is_certain) {
+        within_m2 = limit_m2(s, predicted + variance);
+    }
+    if (!one->is_known || !(is_certain || (may_be_several && are_few(s, within_m2)))) {
         open(s, state, one, innovation, variance);
         return PHASE_BEGINS;
     }
-    if (square(innovation) > limit_m2(s, predicted + variance)) {
+    if (!take_cycles(s, innovation, predicted + variance, SQRT(within_m2), wavelength_m(s))) {
         status->phases_refused += 1;
         one->refused_in_row += 1;
         if (one->refused_in_row >= truncated(s->tuning.phases_in_row)) {
@@ -4835,9 +5126,13 @@ INTERNAL int32_t use_phase(State *s, int32_t state, Ambiguity *one, real innovat
     }
     one->refused_in_row = 0;
     status->phases_used += 1;
-    compute_fault_input(s, -1);
-    update(s, innovation, predicted + variance, REAL(1.0));
     return PHASE_USED;
+}
+
+/* Whether the cycles within a distance are few enough, and phases so reliable, that hypotheses are of use. */
+INTERNAL bool are_few(State *s, real within_m2) {
+    bool is_short = REAL(4.0) * within_m2 < square(s->tuning.most_cycles * wavelength_m(s));
+    return is_short && are_phases_reliable(s);
 }
 
 /* Squared innovation beyond which a phase is more likely random than noisy, or may be off by a cycle. */
@@ -4848,6 +5143,16 @@ INTERNAL real limit_m2(State *s, real variance) {
         gate_squared = min_real(gate_squared, -REAL(2.0) * log_(odds));
     }
     return min_real(gate_squared * variance, square(s->tuning.phase_gate * wavelength_m(s)));
+}
+
+/* Update the share of wild phases by how likely the newest is one: all phases are then equally likely. */
+INTERNAL void count_wild(State *s, real variance) {
+    Status *status = &s->status;
+    Tuning *tuning = &s->tuning;
+    real share = max_real(status->wild_share, tuning->least_wild);
+    real wild = share * SQRT(TWO_PI * variance) / wavelength_m(s);
+    real is_wild = wild / (wild + (REAL(1.0) - share) * s->hypotheses.fit);
+    status->wild_share += tuning->slow_forgetting * (is_wild - status->wild_share);
 }
 
 /* Adapt the variance of phases to innovations beyond their prediction: reflections differ in size. */
@@ -4863,17 +5168,30 @@ INTERNAL void learn_noise(State *s, real shown_m2) {
 INTERNAL bool may_count(State *s) {
     Status *status = &s->status;
     Tuning *tuning = &s->tuning;
-    if (status->mean_nis > tuning->wrong_nis) {
+    settle_hypotheses(s);
+    if (!are_phases_reliable(s)) {
+        give_up_hypotheses(s);
+    }
+    if (status->mean_nis > tuning->wrong_nis || stay_apart(s)) {
         close_phases(s);
     }
     bool is_settled = (real)(status->epoch_ticks - status->start_ticks) * TICK_S >= tuning->new_start_s;
     return is_settled && status->mean_nis <= tuning->wrong_nis;
 }
 
+/* Whether the positions of hypotheses differ by more than stamps err. */
+INTERNAL bool stay_apart(State *s) {
+    real apart_m2 = REAL(0.0);
+    for (int32_t axis = 0, axis_end = s->dim; axis < axis_end; axis++) {
+        apart_m2 += scatter(s, axis, axis);
+    }
+    return apart_m2 > square(s->tuning.apart_m);
+}
+
 /* Restart all ambiguities of the tag's receptions, which may be wrong by cycles. */
 INTERNAL void close_phases(State *s) {
+    give_up_hypotheses(s);
     for (int32_t anchor = 0, anchor_end = s->count; anchor < anchor_end; anchor++) {
-        s->anchors[anchor].has_former = false;
         s->anchors[anchor].own.is_known = false;
     }
 }
@@ -4914,9 +5232,6 @@ INTERNAL void follow_line(State *s) {
     for (int32_t anchor = 0, anchor_end = s->count; anchor < anchor_end; anchor++) {
         if (s->anchors[anchor].own.is_known) {
             turn(s, anchor, s->layout.ambiguity + anchor);
-        }
-        if (s->anchors[anchor].has_former) {
-            turn(s, anchor, s->layout.former + anchor);
         }
     }
     for (int32_t axis = 0, axis_end = s->dim; axis < axis_end; axis++) {
@@ -4990,58 +5305,6 @@ INTERNAL void open(State *s, int32_t state, Ambiguity *one, real innovation, rea
     s->x[state] = ambiguity_m;
 }
 
-/* Resolving the cycles lost in a gap */
-
-/* Keep an ambiguity that ends, unless a recent one is kept already. */
-INTERNAL void keep_former(State *s, int32_t anchor) {
-    Anchor *a = &s->anchors[anchor];
-    int32_t former = s->layout.former + anchor;
-    int32_t ambiguity = s->layout.ambiguity + anchor;
-    if (a->has_former && former_age_s(s, anchor) < s->tuning.phase_former_s) {
-        return;
-    }
-    a->has_former = true;
-    a->former_ticks = s->status.epoch_ticks;
-    s->x[former] = s->x[ambiguity];
-    for (int32_t state = 0, state_end = s->n; state < state_end; state++) {
-        set_covariance(s, former, state, s->P[at(ambiguity, state)]);
-    }
-    s->P[at(former, former)] = s->P[at(ambiguity, ambiguity)];
-    for (int32_t fault = 0, fault_end = s->rows; fault < fault_end; fault++) {
-        s->V[former][fault] = s->V[ambiguity][fault];
-    }
-}
-
-INTERNAL real former_age_s(State *s, int32_t anchor) {
-    return (real)(s->status.epoch_ticks - s->anchors[anchor].former_ticks) * TICK_S;
-}
-
-/* Equate an ambiguity and its former one up to whole cycles, once their number is certain.
- *
- * Receptions after a gap show how clocks and tag have moved within it. */
-INTERNAL void rejoin(State *s, int32_t anchor) {
-    Anchor *a = &s->anchors[anchor];
-    if (former_age_s(s, anchor) > s->tuning.phase_former_s) {
-        a->has_former = false;
-        return;
-    }
-    s->terms = 0;
-    add_term(s, s->layout.ambiguity + anchor, REAL(1.0));
-    add_term(s, s->layout.former + anchor, -REAL(1.0));
-    real predicted = compute_ph(s);
-    real variance = s->status.phase_variance_m2;
-    if (predicted > certain_m2(s)) {
-        return;
-    }
-    real innovation = innovation_m(s, REAL(0.0), h_dot_x(s, 0));
-    a->has_former = false;
-    if (square(innovation) <= limit_m2(s, predicted + variance)) {
-        s->status.phases_rejoined += 1;
-        compute_fault_input(s, -1);
-        update(s, innovation, predicted + variance, REAL(1.0));
-    }
-}
-
 /* Covariance analysis */
 
 /* Process a phase at the tag's true position with an innovation of zero, for a bound without cycles.
@@ -5054,7 +5317,15 @@ INTERNAL void known_phase(State *s, int32_t anchor, real walked_m) {
     }
     s->P[at(ambiguity, ambiguity)] += s->settings.phase_wander * walked_m;
     phase_terms(s, anchor);
-    use_phase(s, ambiguity, &s->anchors[anchor].own, REAL(0.0), s->status.phase_variance_m2);
+    Ambiguity *own = &s->anchors[anchor].own;
+    real variance = s->status.phase_variance_m2;
+    real predicted = compute_ph(s);
+    if (own->is_known) {
+        compute_fault_input(s, -1);
+        update(s, REAL(0.0), predicted + variance, REAL(1.0));
+    } else {
+        open(s, ambiguity, own, REAL(0.0), variance);
+    }
 }
 
 /* The predicted phase of a reception in cycles, for which ``own_phase`` has an innovation of zero. */
@@ -5221,6 +5492,9 @@ INTERNAL int32_t process_of(State *s, int32_t anchor, Packet *packet, Relays *re
             }
         }
     }
+    if (PHASE_STATES > 0) {
+        settle_hypotheses(s);
+    }
     check_motion_and_faults(s, elapsed_s);
     return outcome;
 }
@@ -5326,13 +5600,12 @@ INTERNAL void check_motion_and_faults(State *s, real elapsed_s) {
 /* Fill the rows of a fix. */
 INTERNAL void fill_fix(State *s) {
     int32_t velocity = s->layout.velocity;
-    real scale = covariance_scale(s);
     for (int32_t one = 0, one_end = s->dim; one < one_end; one++) {
         s->fix[POSITION][one] = s->x[one];
         s->fix[VELOCITY][one] = s->x[velocity + one];
         for (int32_t other = 0, other_end = s->dim; other < other_end; other++) {
-            s->fix[POSITION + 1 + one][other] = scale * s->P[at(one, other)];
-            s->fix[VELOCITY + 1 + one][other] = scale * s->P[at(velocity + one, velocity + other)];
+            s->fix[POSITION + 1 + one][other] = motion_covariance(s, one, other);
+            s->fix[VELOCITY + 1 + one][other] = motion_covariance(s, velocity + one, velocity + other);
         }
     }
     if (s->dim == 2) {
@@ -5340,6 +5613,9 @@ INTERNAL void fill_fix(State *s) {
     }
     if (MOTION_STATES > 0) {
         fill_orientation(s);
+    }
+    if (PHASE_STATES > 0) {
+        s->fix[ORIENTATION + 1][2] = (real)(follows_cycles(s) ? max_32(s->hypotheses.count, 1) : 0);
     }
     protect(s);
     s->fix[QUALITY][0] = s->status.mean_nis;
@@ -5427,7 +5703,7 @@ INTERNAL void fill_row(State *s, BatchRow *row, bool has_levels) {
         row->position_m[one] = s->x[one];
         row->velocity_mps[one] = s->x[s->layout.velocity + one];
         for (int32_t other = 0, other_end = s->dim; other < other_end; other++) {
-            row->covariance_m2[one][other] = s->P[at(one, other)];
+            row->covariance_m2[one][other] = s->P[at(one, other)] + scatter(s, one, other);
         }
     }
     if (has_levels) {
@@ -5499,10 +5775,10 @@ SKYLESS_EXPORT void skyless_find_steady_state(State *s, PlannedMessage *messages
 /* Find what the filter claims for a tag that rests for some superframes and then walks for others.
  *
  * ``found`` holds the fixes and variances of the last superframe. A state with phases gets one for each message of
- * which at least half arrive; the phases are as predicted, so cycles are ambiguous wherever they are for the filter. */
+ * which at least half arrive; the phases are as predicted, so cycles are ambiguous wherever they are for the filter.
+ * Messages must not be late. */
 SKYLESS_EXPORT void skyless_find_walked(State *s, PlannedMessage *messages, PlannedRelay *relays, int32_t count, int32_t
         at_rest, real *velocity_mps, int32_t walked, SteadyState *found) {
-    s->rows = walls(s) + 1;
     int64_t superframe = 0;
     for (int32_t one = 0; one < count; one++) {
         superframe += messages[one].gap_ticks;
@@ -5553,10 +5829,12 @@ INTERNAL void process_superframe(State *s, PlannedMessage *messages, PlannedRela
 INTERNAL void add_fix(State *s, real share, SteadyState *found) {
     found->fixes += share;
     for (int32_t axis = 0, axis_end = s->dim; axis < axis_end; axis++) {
-        found->variance_m2[axis] += share * s->P[at(axis, axis)];
-        found->square_bias_m2 += share * square(s->V[axis][walls(s)]);
-        for (int32_t row = walls(s) + 1, row_end = s->rows; row < row_end; row++) {
-            found->motion_m2[axis] += share * square(s->V[axis][row]);
+        found->variance_m2[axis] += share * (s->P[at(axis, axis)] + scatter(s, axis, axis));
+        if (!s->status.has_phases) {  /* with phases these columns are hypotheses */
+            found->square_bias_m2 += share * square(s->V[axis][walls(s)]);
+            for (int32_t row = walls(s) + 1, row_end = s->rows; row < row_end; row++) {
+                found->motion_m2[axis] += share * square(s->V[axis][row]);
+            }
         }
     }
 }
@@ -7473,9 +7751,10 @@ SKYLESS_EXPORT void skyless_begin_tag(Tag *t, int32_t site, real qa, real lowest
             .least_change_std_m = REAL(0.05), .earliest_m = (real)-__builtin_inf(), .difference_std_m = REAL(0.12),
             .stationary_s = REAL(0.0), .integrity_risk = REAL(0.0001), .alert_limit_m = (real)__builtin_nan("")},
             .tuning = {.restart_m = REAL(300.0), .start_walk_scale = REAL(100.0), .mean_gain = REAL(0.05), .noise_growth
-            = REAL(1.2), .max_walk_scale = REAL(10000.0), .noise_loss = REAL(0.99), .common = REAL(1.5), .relays_in_row
-            = REAL(8.0), .steady_walk_scale = REAL(4.0), .max_scale = REAL(100.0), .lag_limit = REAL(3.5), .sudden_lag =
-            REAL(9.0), .walking_mps = REAL(4.0), .better_known = REAL(0.8), .stationary_noise_share = REAL(2e-07),
+            = REAL(1.2), .max_walk_scale = REAL(10000.0), .noise_loss = REAL(0.99), .common = REAL(1.5), .rate_s =
+            REAL(0.5), .rate_changes = REAL(20.0), .least_walk_scale = REAL(0.02), .relays_in_row = REAL(8.0),
+            .steady_walk_scale = REAL(4.0), .max_scale = REAL(100.0), .lag_limit = REAL(3.5), .sudden_lag = REAL(9.0),
+            .walking_mps = REAL(4.0), .better_known = REAL(0.8), .stationary_noise_share = REAL(2e-07),
             .stationary_std_mps = REAL(0.01), .longest_gap_s = REAL(0.3), .shock_mps2 = REAL(100.0), .shock_rps =
             REAL(20.0), .short_gap_s = REAL(0.05), .wrong_scale = REAL(60.0), .wrong_speed_nis = REAL(5.0), .wrong_s =
             REAL(1.5), .ignored_s = REAL(20.0), .level_s = REAL(0.5), .rest_rps = REAL(0.1), .rest_mps2 = REAL(0.5),
@@ -7506,10 +7785,12 @@ SKYLESS_EXPORT void skyless_begin_tag(Tag *t, int32_t site, real qa, real lowest
             .height_margin_m = REAL(1.0), .neighbourhood = REAL(1.5), .most_horizontal_std_m = REAL(3.0),
             .zero_variance_m2 = REAL(10000.0), .phase_start_std_m = REAL(0.002), .phase_max_std_m = REAL(0.006),
             .phase_mesh_std_m = REAL(0.0012), .phase_wander = REAL(25.0), .phase_gate = REAL(0.35), .phase_share =
-            REAL(0.1), .phase_step_m = REAL(0.02), .phase_former_s = REAL(0.5), .phases_in_row = REAL(4.0),
-            .uncovered_chi2 = REAL(240.0), .max_open_level_std = REAL(0.02), .contradicted_start_s = REAL(5.0), .probe_m
-            = REAL(1.0), .shift_part = REAL(0.25), .apart_chi2 = REAL(20.0), .sensor_valid_s = REAL(1.0)}, .is_starting
-            = true, .misfit = -1, .relays_may_contradict = true, .may_begin_again = true};
+            REAL(0.1), .phase_step_m = REAL(0.02), .most_cycles = REAL(3.0), .least_wild = REAL(0.002), .most_wild =
+            REAL(0.01), .phase_slow_mps = REAL(1.4), .unlikely_log_odds = REAL(14.0), .apart_m = REAL(0.03),
+            .phase_walking_mps = REAL(0.7), .speed_memory_s = REAL(1.0), .phases_in_row = REAL(4.0), .uncovered_chi2 =
+            REAL(240.0), .max_open_level_std = REAL(0.02), .contradicted_start_s = REAL(5.0), .probe_m = REAL(1.0),
+            .shift_part = REAL(0.25), .apart_chi2 = REAL(20.0), .sensor_valid_s = REAL(1.0)}, .is_starting = true,
+            .misfit = -1, .relays_may_contradict = true, .may_begin_again = true};
     t->owner.qa = qa;
     t->owner.lowest_m = lowest_m;
     t->owner.highest_m = highest_m;

@@ -7,6 +7,7 @@
  * skyless.core.air.site_choice
  * skyless.core.air.site_pages
  * skyless.core.estimator.faults
+ * skyless.core.estimator.hypotheses
  * skyless.core.estimator.kalman
  * skyless.core.estimator.levels
  * skyless.core.estimator.measurements
@@ -162,6 +163,10 @@ typedef double real;
 #define HEIGHT_GIVEN 1
 #define HOST_JUMPED 2
 #define HPL 0
+/* Most hypotheses on cycles of phases; 0 if phases are not used. */
+#ifndef HYPOTHESES
+#define HYPOTHESES 16
+#endif
 #define IMPOSSIBLE 3
 #define IMPOSSIBLE_HOST_TIME 6
 #define IMPOSSIBLE_SIGMAS REAL(6.0)
@@ -314,7 +319,7 @@ typedef double real;
 #define OBSTRUCTED 1
 #define ONES INT64_C(4294967295)
 /* Quaternion w, x, y, z that turns the frame of a motion sensor into the site's, then the heading's standard deviation
- * [rad], in two rows; zeros if unknown. Only of methods that use one. */
+ * [rad], in two rows; zeros if unknown. Only of methods that use one. Last the number of hypotheses on carrier phases. */
 #define ORIENTATION 10
 /* Columns are orthogonal if the cosine of their angle does not exceed this. */
 #define ORTHOGONAL REAL(1e-14)
@@ -337,7 +342,7 @@ typedef double real;
 #define PHASE_REFUSED 1
 /* States of each anchor for carrier phases; 0 if they are not used. */
 #ifndef PHASE_STATES
-#define PHASE_STATES 3
+#define PHASE_STATES 2
 #endif
 /* Phase steps in a cycle; also the bit that marks the presence of a phase. */
 #define PHASE_STEPS 128
@@ -387,7 +392,7 @@ typedef double real;
 #define SCHEDULE_PAGE 2
 #define SEARCHING 26
 /* Capacity for columns of V. */
-#define SENSITIVITIES (FAULTS + PLANNED_FAULTS)
+#define SENSITIVITIES (FAULTS + PLANNED_FAULTS + HYPOTHESES)
 /* Whether the search for a start uses the memory of the state, which is unused meanwhile. */
 #ifndef SHARES_MEMORY
 #define SHARES_MEMORY false
@@ -682,6 +687,10 @@ typedef struct Tuning {
     real noise_loss;  /* … and its factor with every other innovation. */
     /* If the normalised innovations of all anchors are beyond this on one side, the tag's clock has left its rate. */
     real common;
+    /* Time over which rates of clocks are compared, while phases are in use, to learn how little they wander [s] … */
+    real rate_s;
+    real rate_changes;  /* … the number of changes remembered … */
+    real least_walk_scale;  /* … and the smallest factor on that of the settings. */
     /* Consecutive relays of a pair beyond the gate that show that its path has jumped; fewer may be late. */
     real relays_in_row;
     /* Largest factor on the random walk of a clock at which an anchor's report is used: its filter assumes 1. */
@@ -846,8 +855,15 @@ typedef struct Tuning {
     /* Largest standard deviation of a prediction that determines the cycle, as a fraction of a wavelength. */
     real phase_share;
     real phase_step_m;  /* Length of the steps by which reflections change phases [m]. */
-    /* Time for which an ambiguity from before a gap is kept, to resolve the cycles lost in it [s]. */
-    real phase_former_s;
+    real most_cycles;  /* Number of cycles within the gate beyond which hypotheses on them are of no use. */
+    real least_wild;  /* Share of wild phases that is expected at least, so that they can be found. */
+    real most_wild;  /* Share beyond which hypotheses on cycles are misleading. */
+    /* Speed beyond which relayed phases are not taken at several cycles: the tag's own need all hypotheses [m/s]. */
+    real phase_slow_mps;
+    real unlikely_log_odds;  /* Logarithm of the odds against a hypothesis beyond which it is dropped. */
+    real apart_m;  /* Standard deviation of the positions of hypotheses beyond which they are given up [m]. */
+    real phase_walking_mps;  /* The same as ``walking_mps`` while phases may be taken at several cycles [m/s] … */
+    real speed_memory_s;  /* … for the largest speed within this time [s]. */
     real phases_in_row;  /* Consecutive phases of an anchor beyond the gate at which its ambiguity restarts. */
     real uncovered_chi2;  /* Test beyond which faults exceed what levels cover. */
     /* Fraction of the mean range: a larger standard deviation has no level while all range errors are open. */
@@ -975,8 +991,7 @@ typedef struct Layout {
     /* These two exist only with a motion sensor; without, they equal ``ambiguity`` and are not used. */
     int32_t acceleration;
     int32_t ambiguity;
-    int32_t mesh;
-    int32_t former;  /* The last three exist only with phases; without, they equal ``change`` and are not used. */
+    int32_t mesh;  /* The last two exist only with phases; without, they equal ``change`` and are not used. */
     int32_t change;
     int32_t constant;
     int32_t slope;
@@ -1032,6 +1047,13 @@ typedef struct Status {
     real plane_m[3];  /* A point of the plane that fits the anchors best. */
     real plane_normal[3];  /* Normal of that plane. */
     bool has_phases;  /* Whether phases are in use, so that there are ambiguities. */
+    int64_t rate_ticks;  /* Tag time at which rates of clocks were compared. */
+    real rate_s;  /* Time from the comparison before. */
+    int64_t rate_changes;
+    real anchors_walk;  /* Random walk of the anchors' clocks by changes of their rates [m²/s³]. */
+    real tag_walk;  /* The same of the tag's. */
+    /* Square of the largest speed of late, with a memory of ``speed_memory_s``, while phases are in use. */
+    real recent_square;
     /* Point at which phases are linearised: a position of the tag, moved from then on by its velocity alone. */
     real line_m[3];
     real step_m[3];  /* The tag's position after its last step … */
@@ -1040,8 +1062,7 @@ typedef struct Status {
     real wild_share;  /* Running share of phases beyond the gate. */
     int64_t phases_used;
     int64_t phases_refused;
-    int64_t phases_opened;  /* Ambiguities that began or restarted … */
-    int64_t phases_rejoined;  /* … and those of them whose number of lost cycles was resolved afterwards. */
+    int64_t phases_opened;  /* Ambiguities that began or restarted. */
     bool has_open_ranges;  /* Whether anchors join with range errors beyond those of the settings. */
     int32_t range_errors;  /* ``NO_RANGE_ERRORS``, ``CHANGING_RANGE_ERRORS`` or ``ALL_RANGE_ERRORS``. */
     real fault_std_m[3];  /* Prior standard deviation of each kind of faults. */
@@ -1086,6 +1107,23 @@ typedef struct Motion {
     int64_t gaps;  /* … and gaps after which level and heading were looked for again. */
 } Motion;
 
+/* Hypotheses on the cycles of phases (``hypotheses``); their deviations from x are columns of V behind the faults.
+ *
+ * Arrays have one element more than is used, as there may be no hypotheses at all. */
+typedef struct Hypotheses {
+    int32_t count;  /* 0 if all cycles are certain. */
+    real fit;  /* Likelihood of the newest phase, of 1 for an innovation of zero. */
+    real weight[HYPOTHESES + 1];
+    /* Logarithms of the present weights, up to a constant; ``weight`` is as of the newest mean. */
+    real log_weight[HYPOTHESES + 1];
+    /* Number of hypotheses that follow from these by a phase, the most likely first, and what each consists of. */
+    int32_t found;
+    real new_log_weight[HYPOTHESES + 1];
+    int32_t parent[HYPOTHESES + 1];
+    real shift_m[HYPOTHESES + 1];
+    real old[HYPOTHESES + 1];
+} Hypotheses;
+
 /* Record of an ambiguity beside its state. */
 typedef struct Ambiguity {
     bool is_known;
@@ -1123,9 +1161,11 @@ typedef struct Anchor {
     real place_residual_m[2];  /* Residuals of its receptions after the last two steps. */
     Ambiguity own;  /* Ambiguity of the tag's receptions of it. */
     Ambiguity mesh;  /* Ambiguity of its receptions of its partner. */
+    int64_t rate_offset_ticks;  /* Its offset when rates of clocks were compared … */
+    real rate_offset_m;  /* … and the rest of it. */
+    real mean_rate_mps;  /* Its mean rate from the comparison before. */
+    int32_t rates;  /* Consecutive comparisons that it took part in. */
     int32_t partner;  /* Identifier of the partner, −1 if none. */
-    bool has_former;
-    int64_t former_ticks;  /* Tag time of the end of its former ambiguity. */
     real phase_way_m;  /* ``Status.way_m`` at its newest phase. */
 } Anchor;
 
@@ -1151,7 +1191,7 @@ typedef struct State {
     real x[STATES];
     real P[COVARIANCES];  /* Row by row, symmetric to the bit; see ``at``. */
     /* Sensitivity of x to faults: for each kind to each metre by which an anchor is received late, then to faults added
-     * by planning. */
+     * by planning; or the deviations of hypotheses on cycles. */
     real V[STATES][SENSITIVITIES];
     EstimatorSettings settings;
     Tuning tuning;
@@ -1165,6 +1205,7 @@ typedef struct State {
     Layout layout;
     Status status;
     Motion motion;
+    Hypotheses hypotheses;
     real information[FAULTS][FAULTS];  /* Information of the innovations on all faults, M; lower triangle. */
     real evidence[FAULTS];  /* Evidence of the innovations for all faults, y. */
     /* Covariance of the lasting faults, (M + I/σ_f²)⁻¹, as M grows without limit and 1/σ_f² would be lost in it. */

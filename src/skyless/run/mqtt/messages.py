@@ -190,6 +190,8 @@ class TagHealth(Struct, frozen=True):
     """Distance walked within which ranges change by ``multipath_std_m``."""
     carrier_phase_anchors: tuple[int, ...] = ()
     """Identifiers of the anchors whose carrier phases are in use."""
+    carrier_phase_hypotheses: int = 0
+    """Number of positions that are possible by these phases (``Fix.hypotheses``)."""
     on_board: bool = False
     """Whether the tag's board computes the fixes, and its program only passes them on."""
     battery_share: float | None = None

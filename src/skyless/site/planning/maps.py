@@ -209,13 +209,13 @@ class Predictor:
 
     def _walked_sigma(self, point: Vector, velocity_mps: Vector, has_phases: bool) -> float:
         """Standard deviation after a rest at a point and a walk of a second."""
-        (share,), (delay_m,) = self.scene.heard_at(point[None])
+        (share,), _ = self.scene.heard_at(point[None])
         rows = anchors_in_use(self.scene, point, share)
         if len(rows) <= self.dim:
             return math.inf
         s = _state_at(self._estimator, self.anchors_m, rows, point, has_phases)
         s.tuning.slow_forgetting = 0.0  # nothing is learnt from innovations of zero
-        columns, found = _planned(self.superframe, self.relays, share, delay_m, rows), SteadyState()
+        columns, found = _planned(self.superframe, self.relays, share, np.zeros_like(share), rows), SteadyState()
         length_s = self.superframe.gap_s.sum()
         walked, at_rest = max(1, round(1.0 / length_s)), math.ceil(_RESTED_S / length_s)
         velocity = np.ascontiguousarray(velocity_mps / (walked * length_s))

@@ -282,6 +282,12 @@ function methodWords({ method, on_board }) {
   return on_board ? `${method}, on its board${state.simulated ? " (emulated)" : ""}` : method;
 }
 
+function phaseWords({ carrier_phase_anchors: anchors, carrier_phase_hypotheses: left }) {
+  if (!anchors?.length) return null;
+  const state = left > 1 ? `, locking (${left} left)` : left === 1 ? ", locked" : "";
+  return `of anchors ${anchors.join(", ")}${state}`;
+}
+
 function healthFacts(health) {
   const { updates_per_s, first_fix_s, latency_p50_s, latency_p99_s, counters, cpu, memory_bytes } = health;
   const dropped = Object.entries(counters).filter(([, count]) => count);
@@ -292,7 +298,7 @@ function healthFacts(health) {
     "Time to first fix": first_fix_s == null ? null : duration(first_fix_s),
     Latency: latency_p50_s == null ? null : `${duration(latency_p50_s)}, p99 ${duration(latency_p99_s)}`,
     Method: methodWords(health),
-    "Carrier phases": health.carrier_phase_anchors?.length ? `of anchors ${health.carrier_phase_anchors.join(", ")}` : null,
+    "Carrier phases": phaseWords(health),
     Dropped: dropped.map(([name, count]) => `${count} ${name}`).join(", ") || "none",
     CPU: `${(100 * cpu).toFixed(1)} %`,
     Memory: bytes(memory_bytes),
