@@ -66,6 +66,9 @@ MECHANISMS: dict[str, dict[str, float]] = {
     "Jumps of pairs' paths": {"relays_in_row": OFF},
     "Reports only of steady clocks": {"steady_walk_scale": OFF},
     "A mean NIS of more than 2 is acted on": {"wrong_nis": OFF},
+    "Phases are taken at several cycles": {"most_cycles": 0.0},
+    "… not where they are often wild": {"most_wild": 1.0},
+    "Clocks that wander little are found by their rates": {"rate_s": OFF},
     "Multipath is learnt": {"place_samples": OFF},
     "Ranges are linearised at held points": {"held_step_m": 0.0, "held_max_m": 0.0},
     "Curvature of ranges": {"curvature_share": OFF},
@@ -115,7 +118,13 @@ LAB = {
     "one anchor +1.5 m in bursts": "bursts",
     "rounds at 5 m/s": "5 m/s",
 }
-"""Cases of the studies, and the columns' names."""
+PHASES = {
+    "10 % wild": "10 % wild",
+    "past a wall": "wall, phases",
+    "walking, 100/s, 1e-09": "walking, 100/s",
+    "hands, 400/s, 5e-09": "hands, 400/s",
+}
+"""Cases of the studies, and the columns' names; of those with phases."""
 
 RECORDED = (
     "const1-trial1-tdoa2",
@@ -159,6 +168,8 @@ def cases(seed: int, count: int) -> list[Case]:
     plan = structs.replace(plan_of("joint", seed, study="room"), worlds=4 * count, tags=4, seconds=15.0)
     named = {ROOM[case.name]: case for case in room.cases(plan) if case.name in ROOM}
     plan = structs.replace(plan, worlds=count)
+    with_phases = room.cases(structs.replace(plan, conditions="phase"))
+    named |= {PHASES[case.name]: case for case in with_phases if case.name in PHASES}
     for conditions in ("loss", "nlos", "motion"):
         in_lab = room.cases(structs.replace(plan, conditions=conditions))
         named |= {LAB[case.name]: case for case in in_lab if case.name in LAB}

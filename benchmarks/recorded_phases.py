@@ -1,10 +1,11 @@
 """What phases of the carrier give on the recording of MULoc: the figures of docs/phases.md.
 
-    python benchmarks/recorded_phases.py FOLDER/location1_2.npz
+    python benchmarks/recorded_phases.py FOLDER/location1_2.npz [SHARE SEED]
 
-Per channel, by stamps alone and with phases: errors at the stops, over the whole way and from 0.8 m on; shape (the
-stops' mean errors less their mean); NEES for each dimension; fixes beyond their level; speed at rest from half a
-second, and how far places over 0.2 s scatter within a stop. The first and last stop are left out of the last two.
+With a share of the packets, drawn at random. Per channel, by stamps alone and with phases: errors at the stops, over
+the whole way and from 0.8 m on; shape (the stops' mean errors less their mean); NEES for each dimension; fixes beyond
+their level; speed at rest from half a second, and how far places over 0.2 s scatter within a stop, both without the
+first and last one.
 """
 
 import sys
@@ -26,14 +27,14 @@ WALKED_STOPS: Final = 2
 """Stops before 0.8 m have been walked."""
 
 
-def tracked(path: Path, channel: int, *, has_phases: bool) -> Array:
+def tracked(path: Path, channel: int, share: float = 1.0, seed: int = 0, *, has_phases: bool) -> Array:
     """Time, position and covariance in two dimensions, and level, shape (fixes, 8)."""
+    draw = np.random.default_rng(seed)
     settings = MASTERLESS.changed(carrier_cycles=CARRIER_CYCLES[channel] if has_phases else 0, height_m=0.0)
     tracking, rows = PacketTracking(settings, muloc.muloc_anchors(path), 40), []
     with path.open("rb") as stream:
         for packet in muloc.read_muloc(stream, Counter(), channel):
-            fix = tracking.on_packet(packet)
-            if fix is not None:
+            if draw.random() < share and (fix := tracking.on_packet(packet)) is not None:
                 level_m = np.nan if fix.hpl_m is None else fix.hpl_m
                 rows.append((fix.time_s, *fix.position_m[:2], *fix.covariance_m2[:2, :2].ravel(), level_m))
     return np.array(rows)
@@ -85,12 +86,12 @@ def figures(rows: Array, stops: list[tuple[float, float, Array]]) -> str:
 
 def main() -> None:
     """Print two lines for each channel."""
-    path = Path(sys.argv[1])
-    stops = stops_of(path)
+    path, share, seed = (*sys.argv[1:], 1.0, 0)[:3]
+    stops = stops_of(Path(path))
     for channel in muloc.CHANNELS:
         for has_phases in (False, True):
             name = "with phases " if has_phases else "stamps alone"
-            found = figures(tracked(path, channel, has_phases=has_phases), stops)
+            found = figures(tracked(Path(path), channel, float(share), int(seed), has_phases=has_phases), stops)
             print(f"channel {channel}, {name}: {found}", flush=True)
 
 

@@ -1,13 +1,16 @@
 """Phases of the carrier: what they must not depend on, what they must not harm, and what they buy."""
 
+from functools import partial
+
 import numpy as np
 import pytest
 from msgspec.structs import replace
 
 from skyless.core.any_receiver import AnyReceiver
-from skyless.research.studies.worlds import Heard, Run, beacons_of
-from skyless.sim.evaluation.scenarios import Request, Room, impairments_of, trajectories_of
-from skyless.sim.impairments import CarrierModel, RangeErrorModel
+from skyless.research.studies.runner import Plan
+from skyless.research.studies.worlds import Heard, Run, beacons_of, box, run_world, worlds
+from skyless.sim.evaluation.scenarios import Request, Room, impairments_of, trajectories_of, wanderer
+from skyless.sim.impairments import Body, CarrierModel, RangeErrorModel
 from skyless.sim.lab import lab_site
 
 SITE = lab_site()
@@ -104,3 +107,34 @@ def test_the_room_with_phases_against_the_room_by_stamps(carrier, most):
             errors = np.sum((found - np.array([truth_m[:2] for _, truth_m in receptions])) ** 2, axis=1)
             squares[place] += np.nanmean(errors[len(errors) // 5 :])
     assert np.sqrt(squares[1] / squares[0]) < most
+
+
+@pytest.mark.statistical
+@pytest.mark.parametrize(
+    ("rate_hz", "random_walk_fm", "carrier", "body", "most"),
+    [
+        (67.0, 5e-9, USUAL, None, 0.7),
+        (10.0, 5e-9, USUAL, None, 1.05),
+        (67.0, 5e-9, CarrierModel(wild=0.1), None, 1.05),
+        (67.0, 5e-9, CarrierModel(slips=0.01), None, 1.0),
+        (67.0, 5e-9, USUAL, Body(), 1.15),
+    ],
+)
+def test_hands_with_phases_against_hands_by_stamps(rate_hz, random_walk_fm, carrier, body, most):
+    """The same receptions of tags in hands, plain crystals; levels are exceeded as often, but for 10⁻³ of the fixes."""
+    noise, schedule = replace(SITE.noise, random_walk_fm=random_walk_fm), replace(SITE.schedule, rate_hz=rate_hz)
+    site, (low_m, high_m) = replace(SITE, noise=noise, schedule=schedule), box(SITE)
+    plan = Plan(worlds=4, seed=5, seconds=10.0, conditions="phase", tags=4)
+
+    def paths(seed):
+        return [wanderer(low_m, high_m, seed, tag, 3.0) for tag in range(plan.tags)]
+
+    def tallies(of):
+        change = partial(replace, carrier=of)
+        runs = worlds(plan, site, paths, room=Room(), warmup_s=2.5, change=change, **({"body": body} if body else {}))
+        return [run_world(run) for run in runs]
+
+    stamps, phases = tallies(None), tallies(carrier)
+    assert sum(one.squared_m2 for one in phases) < most**2 * sum(one.squared_m2 for one in stamps)
+    exceeded = [sum(one.levels.exceeded.sum() for one in found) for found in (stamps, phases)]
+    assert exceeded[1] <= exceeded[0] + 1e-3 * sum(one.fixes for one in phases)

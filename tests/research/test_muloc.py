@@ -80,7 +80,7 @@ def test_the_published_recording_is_replayed_without_options(recordings):
     assert report.rmse_2d_m < 0.05
     assert report.exceeded_horizontal == 0
     stamps = skyless.replay(path, stamps_only=True).reports["tag"]
-    assert (stamps.measurements, stamps.judged) == ("packets", report.judged)
+    assert (stamps.measurements, stamps.judged) == ("packets", pytest.approx(report.judged, abs=2))
     assert stamps.rmse_2d_m < 0.06
     assert stamps.exceeded_horizontal == 0
     differences = skyless.replay(path, measurements="differences").reports["tag"]

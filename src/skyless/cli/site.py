@@ -73,6 +73,9 @@ class NewOptions(JsonOptions, frozen=True, kw_only=True):
     """How many anchors, 1 to this number, without positions."""
     paper: bool = False
     """Use the paper's protocol (mode master): the anchor that the others receive best is the master."""
+    phases: bool = False
+    """Let anchors relay the phases of the carrier that their radios measure (DW1000), for tags that know their way to
+    millimetres; as many beacons as fit are what tags in hands need."""
     tag_height: str | None = None
     """The tags' height: metres, at which all of them move (2-D), or free, the default: estimated (3-D). With --spacing,
     whose anchors lie in one plane, the default is 1.2."""
@@ -94,6 +97,10 @@ def new(asked: NewOptions) -> None:
     site = _new_site(asked)
     number = 1 + secrets.randbelow(ANY_ADDRESS) if asked.site_id is None else asked.site_id  # any on the air but 0
     site = replace(site, name=asked.name or file.stem, id=number)
+    if asked.phases:
+        if asked.paper:
+            raise SkylessError("--phases needs anchors that send without a master; leave --paper out")
+        site = replace(site, schedule=replace(site.schedule, carrier_phase=True))
     check_site(site, file)
     write_file(file, site_template(site).encode())
     if asked.json:

@@ -121,8 +121,9 @@ def _set_count(s: State, count: int) -> None:
 def scatter(s: State, state: int, other: int) -> float:
     """Covariance of two states over the hypotheses."""
     total, first = 0.0, FAULT_KINDS * s.count
-    for one in range(s.hypotheses.count):
-        total += s.hypotheses.weight[one] * s.V[state][first + one] * s.V[other][first + one]
+    if HYPOTHESES > 0:
+        for one in range(s.hypotheses.count):
+            total += s.hypotheses.weight[one] * s.V[state][first + one] * s.V[other][first + one]
     return total
 
 

@@ -17,7 +17,7 @@ from skyless.core.estimator.state import (
     set_covariance,
 )
 from skyless.core.native.arithmetic import exp, sqrt, square
-from skyless.core.native.records import MOST_WAITING, MOTION_STATES, PACKED, Reals, Ticks
+from skyless.core.native.records import MOST_WAITING, MOTION_STATES, PACKED, PHASE_STATES, Reals, Ticks
 from skyless.core.ticks import TICK_S
 
 LONGEST_S: Final = 1000.0
@@ -36,9 +36,9 @@ def predict(s: State, rx_ticks: Ticks) -> None:
     status.walked_m += sqrt(speed_squared(s)) * dt
     if status.obstruction > 0.0:
         status.obstruction *= exp(-dt / s.tuning.obstruction_memory_s)
-    for axis in range(s.dim):
-        status.line_m[axis] += s.x[where.velocity + axis] * dt
-    if status.has_phases:
+    if PHASE_STATES > 0:
+        for axis in range(s.dim):
+            status.line_m[axis] += s.x[where.velocity + axis] * dt
         status.recent_square = max(status.recent_square * exp(-dt / s.tuning.speed_memory_s), speed_squared(s))
     _advance(s, dt)
     motion, white_m2 = motion_noise(s), settings.white * dt
@@ -91,12 +91,14 @@ def follows_cycles(s: State) -> bool:
     for anchor in range(s.count):
         if has_phase(s, anchor):
             found += 1
-    return found > s.dim
+    return PHASE_STATES > 0 and found > s.dim
 
 
 def are_phases_reliable(s: State) -> bool:
     """Whether phases are in use, are rarely wild, and range errors have not jumped of late: cycles may be uncertain."""
-    return s.status.has_phases and s.status.wild_share < s.tuning.most_wild and jump_share(s) < 1.0
+    if PHASE_STATES > 0 and s.status.has_phases:
+        return s.status.wild_share < s.tuning.most_wild and jump_share(s) < 1.0
+    return False
 
 
 def _unseen_noise(s: State) -> float:
@@ -323,9 +325,10 @@ def _note_update(s: State, innovation: float, innovation_variance: float, gain_s
         u[state] *= inverse
     for fault in range(s.rows):
         g[fault] *= step
-    for one in range(s.hypotheses.count):
-        off = innovation * inverse + g[FAULT_KINDS * s.count + one]
-        s.hypotheses.log_weight[one] -= 0.5 * off * off
+    if PHASE_STATES > 0:
+        for one in range(s.hypotheses.count):
+            off = innovation * inverse + g[FAULT_KINDS * s.count + one]
+            s.hypotheses.log_weight[one] -= 0.5 * off * off
     step *= innovation
     for state in range(s.used):
         s.x[state] += u[state] * step

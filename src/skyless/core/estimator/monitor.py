@@ -23,7 +23,7 @@ from skyless.core.estimator.hypotheses import scatter
 from skyless.core.estimator.kalman import finish_updates, follows_cycles
 from skyless.core.estimator.state import CHANGING_RANGE_ERRORS, State, at, make_uncertain
 from skyless.core.native.arithmetic import log, sqrt, square
-from skyless.core.native.records import MOTION_STATES
+from skyless.core.native.records import MOTION_STATES, PHASE_STATES
 from skyless.core.ticks import TICK_M, TICK_S
 
 _PLACE_LIMIT: Final = 2.0
@@ -258,9 +258,9 @@ def adapt_clock_noise(s: State, anchor: int, normalised: float) -> None:
 
 def _least_scale(s: State, walk: float) -> float:
     """Factor on the settings' random walk of a clock below which it is not adapted, by what its rates have shown."""
-    if s.status.rate_changes < 2:
-        return 1.0
-    return min(max(walk / s.settings.walk, s.tuning.least_walk_scale), s.tuning.max_walk_scale)
+    if PHASE_STATES > 0 and s.status.rate_changes > 1:
+        return min(max(walk / s.settings.walk, s.tuning.least_walk_scale), s.tuning.max_walk_scale)
+    return 1.0
 
 
 def learn_least_walk(s: State) -> None:

@@ -37,7 +37,7 @@ from skyless.core.estimator.measurements import (
 )
 from skyless.core.estimator.monitor import learn_least_walk
 from skyless.core.estimator.state import Ambiguity, State, at, set_covariance, use_phases
-from skyless.core.native.arithmetic import floor, log, sqrt, square
+from skyless.core.native.arithmetic import exp, floor, log, sqrt, square
 from skyless.core.native.records import Reals, Ticks
 from skyless.core.ticks import TICK_M, TICK_S
 
@@ -69,8 +69,9 @@ def own_phase(s: State, anchor: int, phase_cycles: float) -> None:
     cycles = -phase_cycles - _whole_cycles(s, a.offset_ticks)
     innovation, variance = _innovation_m(s, cycles, expected_m), status.phase_variance_m2
     predicted = compute_ph(s)
+    was_known = a.own.is_known
     outcome = _use_phase(s, ambiguity, a.own, innovation, variance, True)
-    if outcome != PHASE_BEGINS:
+    if was_known:
         _count_wild(s, predicted + variance)
     if outcome == PHASE_USED and predicted <= _certain_m2(s) and s.hypotheses.count == 0:
         _learn_noise(s, square(innovation) - predicted)
@@ -132,6 +133,10 @@ def _use_phase(s: State, state: int, one: Ambiguity, innovation: float, variance
     if is_certain:
         within_m2 = _limit_m2(s, predicted + variance)
     if not one.is_known or not (is_certain or (may_be_several and _are_few(s, within_m2))):
+        s.hypotheses.fit = 0.0
+        for cycle in range(-1, 2):
+            off_m = innovation + cycle * _wavelength_m(s)
+            s.hypotheses.fit += exp(-0.5 * square(off_m) / (predicted + variance))
         _open(s, state, one, innovation, variance)
         return PHASE_BEGINS
     if not take_cycles(s, innovation, predicted + variance, sqrt(within_m2), _wavelength_m(s)):

@@ -299,6 +299,8 @@ class Tuning(Record):
     """Length of the steps by which reflections change phases [m]."""
     most_cycles: float = 3.0
     """Number of cycles within the gate beyond which hypotheses on them are of no use."""
+    start_wild: float = 0.009
+    """Share of wild phases at a start: hypotheses are possible, but not for long if one looks wild."""
     least_wild: float = 0.002
     """Share of wild phases that is expected at least, so that they can be found."""
     most_wild: float = 0.01

@@ -572,6 +572,7 @@ def prepare(s: State) -> None:
     status.fault_std_m[CREEPING] = tuning.creeping_std_m
     status.place_square_m2[0] = status.place_square_m2[1] = status.mean_square_m2 = stamps_m2
     status.place_distance_m = settings.place_distance_m
+    status.wild_share = tuning.start_wild
     status.phase_variance_m2 = square(max(tuning.phase_start_std_m, settings.phase_std_m))
     if settings.place_std_m > 0.0:
         status.range_errors = CHANGING_RANGE_ERRORS

@@ -34,7 +34,7 @@ from skyless.core.estimator.measurements import (
 from skyless.core.estimator.phases import expected_phase, known_phase, own_phase
 from skyless.core.estimator.state import ALL_RANGE_ERRORS, AXES, FAULT_KINDS, State, at
 from skyless.core.native.arithmetic import floor, square
-from skyless.core.native.records import Array, Bytes, Reals, Record, Ticks, record
+from skyless.core.native.records import PHASE_STATES, Array, Bytes, Reals, Record, Ticks, record
 from skyless.core.ticks import TICK_S
 
 IMPULSES: Final = 4  # moments of a superframe at which an acceleration is tried
@@ -229,7 +229,7 @@ def _receive(s: State, message: PlannedMessage, rx_ticks: Ticks) -> None:
             update(s, 0.0, variance)
         else:
             find_rate(s, message.anchor, 0.0, variance, elapsed_s)
-        if s.status.has_phases and message.share >= 0.5:
+        if PHASE_STATES > 0 and s.status.has_phases and message.share >= 0.5:
             own_phase(s, message.anchor, expected_phase(s, message.anchor))
     a.rx_ticks, a.walked_m = rx_ticks, s.status.walked_m
     a.packets += 1

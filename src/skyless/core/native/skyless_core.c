@@ -1701,6 +1701,7 @@ INTERNAL void prepare(State *s) {
     status->place_square_m2[1] = stamps_m2;
     status->place_square_m2[0] = stamps_m2;
     status->place_distance_m = settings->place_distance_m;
+    status->wild_share = tuning->start_wild;
     status->phase_variance_m2 = square(max_real(tuning->phase_start_std_m, settings->phase_std_m));
     if (settings->place_std_m > REAL(0.0)) {
         status->range_errors = CHANGING_RANGE_ERRORS;
@@ -2122,10 +2123,10 @@ INTERNAL void predict(State *s, int64_t rx_ticks) {
     if (status->obstruction > REAL(0.0)) {
         status->obstruction *= exp_(-dt / s->tuning.obstruction_memory_s);
     }
-    for (int32_t axis = 0, axis_end = s->dim; axis < axis_end; axis++) {
-        status->line_m[axis] += s->x[where->velocity + axis] * dt;
-    }
-    if (status->has_phases) {
+    if (PHASE_STATES > 0) {
+        for (int32_t axis = 0, axis_end = s->dim; axis < axis_end; axis++) {
+            status->line_m[axis] += s->x[where->velocity + axis] * dt;
+        }
         status->recent_square = max_real(status->recent_square * exp_(-dt / s->tuning.speed_memory_s),
                 speed_squared(s));
     }
@@ -2193,12 +2194,15 @@ INTERNAL bool follows_cycles(State *s) {
             found += 1;
         }
     }
-    return found > s->dim;
+    return PHASE_STATES > 0 && found > s->dim;
 }
 
 /* Whether phases are in use, are rarely wild, and range errors have not jumped of late: cycles may be uncertain. */
 INTERNAL bool are_phases_reliable(State *s) {
-    return s->status.has_phases && s->status.wild_share < s->tuning.most_wild && jump_share(s) < REAL(1.0);
+    if (PHASE_STATES > 0 && s->status.has_phases) {
+        return s->status.wild_share < s->tuning.most_wild && jump_share(s) < REAL(1.0);
+    }
+    return false;
 }
 
 /* The same of what a motion sensor does not show. */
@@ -2493,9 +2497,11 @@ INTERNAL void note_update(State *s, real innovation, real innovation_variance, r
     for (int32_t fault = 0, fault_end = s->rows; fault < fault_end; fault++) {
         g[fault] *= step;
     }
-    for (int32_t one = 0, one_end = s->hypotheses.count; one < one_end; one++) {
-        real off = innovation * inverse + g[FAULT_KINDS * s->count + one];
-        s->hypotheses.log_weight[one] -= REAL(0.5) * off * off;
+    if (PHASE_STATES > 0) {
+        for (int32_t one = 0, one_end = s->hypotheses.count; one < one_end; one++) {
+            real off = innovation * inverse + g[FAULT_KINDS * s->count + one];
+            s->hypotheses.log_weight[one] -= REAL(0.5) * off * off;
+        }
     }
     step *= innovation;
     for (int32_t state = 0, state_end = s->used; state < state_end; state++) {
@@ -3135,8 +3141,10 @@ INTERNAL void set_count(State *s, int32_t count) {
 INTERNAL real scatter(State *s, int32_t state, int32_t other) {
     real total = REAL(0.0);
     int32_t first = FAULT_KINDS * s->count;
-    for (int32_t one = 0, one_end = s->hypotheses.count; one < one_end; one++) {
-        total += s->hypotheses.weight[one] * s->V[state][first + one] * s->V[other][first + one];
+    if (HYPOTHESES > 0) {
+        for (int32_t one = 0, one_end = s->hypotheses.count; one < one_end; one++) {
+            total += s->hypotheses.weight[one] * s->V[state][first + one] * s->V[other][first + one];
+        }
     }
     return total;
 }
@@ -3442,10 +3450,10 @@ INTERNAL void adapt_clock_noise(State *s, int32_t anchor, real normalised) {
 
 /* Factor on the settings' random walk of a clock below which it is not adapted, by what its rates have shown. */
 INTERNAL real least_scale(State *s, real walk) {
-    if (s->status.rate_changes < 2) {
-        return REAL(1.0);
+    if (PHASE_STATES > 0 && s->status.rate_changes > 1) {
+        return min_real(max_real(walk / s->settings.walk, s->tuning.least_walk_scale), s->tuning.max_walk_scale);
     }
-    return min_real(max_real(walk / s->settings.walk, s->tuning.least_walk_scale), s->tuning.max_walk_scale);
+    return REAL(1.0);
 }
 
 /* Learn how little the clocks wander, from the changes of their mean rates.
@@ -5040,8 +5048,9 @@ INTERNAL void own_phase(State *s, int32_t anchor, real phase_cycles) {
     real innovation = innovation_m(s, cycles, expected_m);
     real variance = status->phase_variance_m2;
     real predicted = compute_ph(s);
+    bool was_known = a->own.is_known;
     int32_t outcome = use_phase(s, ambiguity, &a->own, innovation, variance, true);
-    if (outcome != PHASE_BEGINS) {
+    if (was_known) {
         count_wild(s, predicted + variance);
     }
     if (outcome == PHASE_USED && predicted <= certain_m2(s) && s->hypotheses.count == 0) {
@@ -5113,6 +5122,11 @@ INTERNAL int32_t use_phase(State *s, int32_t state, Ambiguity *one, real innovat
         within_m2 = limit_m2(s, predicted + variance);
     }
     if (!one->is_known || !(is_certain || (may_be_several && are_few(s, within_m2)))) {
+        s->hypotheses.fit = REAL(0.0);
+        for (int32_t cycle = -1; cycle < 2; cycle++) {
+            real off_m = innovation + (real)cycle * wavelength_m(s);
+            s->hypotheses.fit += exp_(-REAL(0.5) * square(off_m) / (predicted + variance));
+        }
         open(s, state, one, innovation, variance);
         return PHASE_BEGINS;
     }
@@ -5876,7 +5890,7 @@ INTERNAL void receive(State *s, PlannedMessage *message, int64_t rx_ticks) {
         } else {
             find_rate(s, message->anchor, REAL(0.0), variance, elapsed_s);
         }
-        if (s->status.has_phases && message->share >= REAL(0.5)) {
+        if (PHASE_STATES > 0 && s->status.has_phases && message->share >= REAL(0.5)) {
             own_phase(s, message->anchor, expected_phase(s, message->anchor));
         }
     }
@@ -7785,12 +7799,12 @@ SKYLESS_EXPORT void skyless_begin_tag(Tag *t, int32_t site, real qa, real lowest
             .height_margin_m = REAL(1.0), .neighbourhood = REAL(1.5), .most_horizontal_std_m = REAL(3.0),
             .zero_variance_m2 = REAL(10000.0), .phase_start_std_m = REAL(0.002), .phase_max_std_m = REAL(0.006),
             .phase_mesh_std_m = REAL(0.0012), .phase_wander = REAL(25.0), .phase_gate = REAL(0.35), .phase_share =
-            REAL(0.1), .phase_step_m = REAL(0.02), .most_cycles = REAL(3.0), .least_wild = REAL(0.002), .most_wild =
-            REAL(0.01), .phase_slow_mps = REAL(1.4), .unlikely_log_odds = REAL(14.0), .apart_m = REAL(0.03),
-            .phase_walking_mps = REAL(0.7), .speed_memory_s = REAL(1.0), .phases_in_row = REAL(4.0), .uncovered_chi2 =
-            REAL(240.0), .max_open_level_std = REAL(0.02), .contradicted_start_s = REAL(5.0), .probe_m = REAL(1.0),
-            .shift_part = REAL(0.25), .apart_chi2 = REAL(20.0), .sensor_valid_s = REAL(1.0)}, .is_starting = true,
-            .misfit = -1, .relays_may_contradict = true, .may_begin_again = true};
+            REAL(0.1), .phase_step_m = REAL(0.02), .most_cycles = REAL(3.0), .start_wild = REAL(0.009), .least_wild =
+            REAL(0.002), .most_wild = REAL(0.01), .phase_slow_mps = REAL(1.4), .unlikely_log_odds = REAL(14.0), .apart_m
+            = REAL(0.03), .phase_walking_mps = REAL(0.7), .speed_memory_s = REAL(1.0), .phases_in_row = REAL(4.0),
+            .uncovered_chi2 = REAL(240.0), .max_open_level_std = REAL(0.02), .contradicted_start_s = REAL(5.0), .probe_m
+            = REAL(1.0), .shift_part = REAL(0.25), .apart_chi2 = REAL(20.0), .sensor_valid_s = REAL(1.0)}, .is_starting
+            = true, .misfit = -1, .relays_may_contradict = true, .may_begin_again = true};
     t->owner.qa = qa;
     t->owner.lowest_m = lowest_m;
     t->owner.highest_m = highest_m;

@@ -856,6 +856,8 @@ typedef struct Tuning {
     real phase_share;
     real phase_step_m;  /* Length of the steps by which reflections change phases [m]. */
     real most_cycles;  /* Number of cycles within the gate beyond which hypotheses on them are of no use. */
+    /* Share of wild phases at a start: hypotheses are possible, but not for long if one looks wild. */
+    real start_wild;
     real least_wild;  /* Share of wild phases that is expected at least, so that they can be found. */
     real most_wild;  /* Share beyond which hypotheses on cycles are misleading. */
     /* Speed beyond which relayed phases are not taken at several cycles: the tag's own need all hypotheses [m/s]. */

@@ -12,6 +12,7 @@ and damping is left out, as no receiver knows it.
 import math
 from collections.abc import Callable, Sequence
 from functools import partial
+from itertools import product
 from typing import Any, Final
 
 import numpy as np
@@ -99,8 +100,8 @@ _PHASE_WARMUP_S: Final = 2.5
 _PHASE_RATIO: Final = 1.05
 """Largest ratio of the RMSE with phases to that by stamps alone."""
 _HANDS_QA_M2PS3: Final = 3.0
-_HANDS: Final = ((20.0, 5e-9), (10.0, 5e-9), (20.0, 1e-9))
-"""Beacons of each anchor a second, and random-walk FM of the crystals, 1/√s; plain ones have 5·10⁻⁹."""
+_LOCKS: Final = (*product(("walking", "hands"), (400.0, 100.0), (1e-9, 5e-9)), ("hands", 60.0, 5e-9))
+"""Motion, beacons of all anchors a second, random-walk FM of the crystals in 1/√s; plain ones have 5·10⁻⁹."""
 
 _LATE_KEY: Final = 23
 _PATH_KEY: Final = 29
@@ -370,7 +371,6 @@ def _phases(plan: Plan) -> list[Case]:
     in_site, usual = lab_site(plan.noise_ps), CarrierModel()
     quiet = replace(usual, reflections=RangeErrorModel())
     stronger = replace(usual, reflections=RangeErrorModel(changing_m=0.008, correlation_m=0.05))
-    relaying = replace(in_site, schedule=replace(in_site.schedule, carrier_phase=True))
     wander = partial(wanderers, in_site, plan.tags)
     in_room = partial(worlds, plan, in_site, wander, room=Room())
     in_lab = partial(walking, plan, paper_lab_site(plan.noise_ps))
@@ -379,14 +379,13 @@ def _phases(plan: Plan) -> list[Case]:
     scenes: list[tuple[str, CarrierModel, Callable[..., tuple[Run, ...]], tuple[Limit, ...]]] = [
         ("lab, no reflections", quiet, in_lab, (Limit("rmse_m", most=0.005), *honest)),
         (BASE, usual, in_room, (Limit("rmse_m", most=0.022), Limit("nees", 0.7, 1.3), exceeded)),
-        (f"{BASE}, phases relayed", usual, partial(worlds, plan, relaying, wander, room=Room()), honest),
         ("at rest", usual, partial(worlds, plan, in_site, partial(still, in_site, plan.tags), room=Room()), honest),
         ("reflections of 8 mm", stronger, in_room, honest),
         ("1 % slips", replace(usual, slips=0.01), in_room, (Limit("nees", most=1.7), exceeded)),
         ("10 % wild", replace(usual, wild=0.1), in_room, honest),
         ("past a wall", usual, past, (exceeded,)),
         ("a body", usual, partial(in_room, body=Body()), (exceeded,)),
-        *((f"hands, {rate:g}/s, {walk:g}", usual, partial(_hands, plan, rate, walk), honest) for rate, walk in _HANDS),
+        *((f"{one[0]}, {one[1]:g}/s, {one[2]:g}", usual, partial(_locking, plan, *one), honest) for one in _LOCKS),
     ]
     found, never_worse = [], Limit("ratio", most=_PHASE_RATIO)
     for name, carrier, runs_of, limits in scenes:
@@ -398,12 +397,13 @@ def _phases(plan: Plan) -> list[Case]:
     return found
 
 
-def _hands(plan: Plan, rate_hz: float, random_walk_fm: float, **options: Any) -> tuple[Run, ...]:  # noqa: ANN401 - of ``worlds``
-    """Tags in hands at this rate of beacons of each anchor."""
+def _locking(plan: Plan, motion: str, rate_hz: float, random_walk_fm: float, **options: Any) -> tuple[Run, ...]:  # noqa: ANN401
+    """Tags that walk or are in hands, at this rate of beacons of all anchors, which relay phases."""
     site = lab_site(plan.noise_ps)
-    noise, schedule = replace(site.noise, random_walk_fm=random_walk_fm), replace(site.schedule, rate_hz=rate_hz)
-    site = replace(site, noise=noise, schedule=schedule)
-    return worlds(plan, site, partial(_hand_paths, site, plan.tags), room=Room(), **options)
+    schedule = replace(site.schedule, rate_hz=rate_hz / len(site.anchors), carrier_phase=True)
+    site = replace(site, noise=replace(site.noise, random_walk_fm=random_walk_fm), schedule=schedule)
+    paths = wanderers if motion == "walking" else _hand_paths
+    return worlds(plan, site, partial(paths, site, plan.tags), room=Room(), **options)
 
 
 def _hand_paths(site: Site, tags: int, seed: int) -> list[Trajectory]:
