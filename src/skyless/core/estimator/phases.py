@@ -69,9 +69,9 @@ def own_phase(s: State, anchor: int, phase_cycles: float) -> None:
     cycles = -phase_cycles - _whole_cycles(s, a.offset_ticks)
     innovation, variance = _innovation_m(s, cycles, expected_m), status.phase_variance_m2
     predicted = compute_ph(s)
-    was_known = a.own.is_known
+    is_telling = a.own.is_known and square(s.settings.gate) * (predicted + variance) < square(_wavelength_m(s))
     outcome = _use_phase(s, ambiguity, a.own, innovation, variance, True)
-    if was_known:
+    if is_telling:
         _count_wild(s, predicted + variance)
     if outcome == PHASE_USED and predicted <= _certain_m2(s) and s.hypotheses.count == 0:
         _learn_noise(s, square(innovation) - predicted)

@@ -5048,9 +5048,9 @@ INTERNAL void own_phase(State *s, int32_t anchor, real phase_cycles) {
     real innovation = innovation_m(s, cycles, expected_m);
     real variance = status->phase_variance_m2;
     real predicted = compute_ph(s);
-    bool was_known = a->own.is_known;
+    bool is_telling = a->own.is_known && square(s->settings.gate) * (predicted + variance) < square(wavelength_m(s));
     int32_t outcome = use_phase(s, ambiguity, &a->own, innovation, variance, true);
-    if (was_known) {
+    if (is_telling) {
         count_wild(s, predicted + variance);
     }
     if (outcome == PHASE_USED && predicted <= certain_m2(s) && s->hypotheses.count == 0) {
