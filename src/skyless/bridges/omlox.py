@@ -37,9 +37,7 @@ MAX_BATCH: Final = 100
 MAX_WAITING: Final = 10_000
 """Most locations waiting for the hub; beyond it the oldest is dropped."""
 
-_GATHER_S: Final = 0.05
 _PAUSE_S: Final = 2.0
-_COMPLAINTS_HZ: Final = 1.0 / 60.0
 _UUID: Final = re.compile(r"[0-9A-Fa-f]{8}(-[0-9A-Fa-f]{4}){3}-[0-9A-Fa-f]{12}")
 
 
@@ -105,7 +103,7 @@ class OmloxPush(Target):
         self._token()
         if scheme == "ws" and not is_loopback(host):
             log(f"{url.text}: positions leave this computer unencrypted; omlox+wss: encrypts")
-        self._log, self._complaints = log, RateLimit(_COMPLAINTS_HZ)
+        self._log, self._complaints = log, RateLimit(1.0 / 60.0)
         self._site: BridgedSite | None = None
         self._waiting: deque[Object] = deque()
 
@@ -142,7 +140,7 @@ class OmloxPush(Target):
                     self.dropped["not-sent"] += len(batch)
                     raise
             if not self._waiting:
-                await asyncio.sleep(_GATHER_S)
+                await asyncio.sleep(0.05)
 
     async def _receive(self, hub: ClientConnection) -> None:
         async for answer in hub:

@@ -352,7 +352,6 @@ async def _live(socket: WebSocket) -> None:
 # Running the dashboard: its socket, its work, and its shutdown.
 
 PORT: Final = 8080
-_MORE_PORTS: Final = 50
 _PING_S: Final = 5.0
 _GRACE_S: Final = 0.4
 _SEND_BUFFER_BYTES: Final = 262_144  # data for a slow page that waits in the kernel and is sent before anything newer
@@ -366,7 +365,7 @@ def bind(host: str, port: int | None) -> socket.socket:
     """
     if port is not None:
         return _bind(host, port)
-    for number in range(PORT, PORT + _MORE_PORTS):
+    for number in range(PORT, PORT + 50):
         held = reserve(host, number)
         if held is None:  # reserved by a demo that is starting
             continue

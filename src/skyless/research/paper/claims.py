@@ -938,7 +938,6 @@ def _rate(plan: Plan, results: Results) -> Found:
 
 _CLAIM_FIXES: Final = 30_000
 """Fixes per position in the paper."""
-_HALVINGS: Final = 50
 _FIT_FROM_PS: Final = 50.0
 """Below, rounding to ticks and the crystals' own noise flatten the curve."""
 
@@ -999,7 +998,7 @@ def largest_of_m(covariance_m2: Array, count: float, quantile: float) -> float:
     weight = variances_m2 / np.sqrt(np.linalg.det(covariance_m2))
     exceed, most_m = -np.expm1(np.log(quantile) / count), 12.0 * float(np.sqrt(np.trace(covariance_m2)))
     least_m = 0.0
-    for _ in range(_HALVINGS):
+    for _ in range(50):
         middle_m = (least_m + most_m) / 2.0
         if np.mean(np.exp(-0.5 * middle_m**2 / variances_m2) * weight) > exceed:
             least_m = middle_m

@@ -34,8 +34,6 @@ from skyless.site.survey.anchor_errors import DifferenceCalibration
 TDOA_SITE: Final = 0
 """Site number in the topics of a system without a site identifier."""
 
-_METHOD: Final = "joint"
-
 _NEW_HEIGHT_M: Final = 0.05  # change of the anchors' mean height that restarts tracking
 
 PacketRadio = SnifferRadio | UciRadio | PhoneRadio
@@ -238,7 +236,7 @@ class PacketTags:
             node.fix_log.update_clock_offset()
             node.check_reception(time.monotonic())
             counted = node.fix_log.health(
-                method=_METHOD,
+                method="joint",
                 receptions=node.packets,
                 reason=str(node.tracking.reason),
                 counters=node.drops,

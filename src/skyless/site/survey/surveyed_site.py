@@ -36,7 +36,6 @@ _DELAY: Final = SITE_LIMITS["anchors.tx_antenna_delay_ticks"]
 _MAX_STATED_M: Final = SITE_LIMITS["anchors.std_m"].high
 _RANGE_STD: Final = SITE_LIMITS["accuracy.range_std_m"]
 _STD_STEPS_PER_M: Final = 1e4
-_POSITION_DIGITS: Final = 4
 _KEYS: Final = ("x_m", "y_m", "z_m", "tx_antenna_delay_ticks", "std_m")
 
 
@@ -173,7 +172,7 @@ def _changes(before: AnchorSite | UnplacedAnchor, after: AnchorSite) -> dict[str
 
 def _rounded(value_m: float) -> float:
     """Round to a tenth of a millimetre, never to minus zero."""
-    return round(value_m, _POSITION_DIGITS) + 0.0
+    return round(value_m, 4) + 0.0
 
 
 def _up(value_m: float, steps_per_m: float) -> float:
