@@ -172,7 +172,6 @@ class AlarmTarget(Target):
 
 
 def _states(alarm: AlarmMessage) -> list[What]:
-    """The changes of an alarm so far."""
     states: list[What] = ["raised"]
     if alarm.acknowledged_unix_s is not None:
         states.append("acknowledged")

@@ -82,7 +82,6 @@ def location(fix: FixMessage, site: BridgedSite, source: str) -> Object:
 
 
 def _known(**fields: object) -> Object:
-    """The fields with a value."""
     return {key: value for key, value in fields.items() if value is not None}
 
 

@@ -312,8 +312,6 @@ def _totals(plain: _Plain, nodes: _Nodes) -> Iterator[Metric]:
 
 
 class _Scrape(Collector):
-    """The metrics of one scrape."""
-
     def __init__(self, families: Iterable[Metric]) -> None:
         self._families = families
 

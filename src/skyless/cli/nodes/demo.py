@@ -531,7 +531,6 @@ async def _place(address: MqttAddress, messages: Mapping[str, bytes], log: Log, 
 
 
 async def _publish(address: MqttAddress, messages: Mapping[str, bytes]) -> None:
-    """Publish retained messages."""
     connection = await open_connection(address, address.tls_context(), Introduction("", _KEEPALIVE_S))
     for topic, text in messages.items():
         connection.publish(topic, text, 1, retain=True)

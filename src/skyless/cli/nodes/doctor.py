@@ -271,7 +271,6 @@ class SiteProbe:
         return Check("site", "ok", f"{finding}.")
 
     def _slots(self) -> Check:
-        """Check of missed transmissions."""
         shares = {anchor: statistics.mean(shares) for anchor, shares in self._missed.items()}
         worst, share = max(shares.items(), key=lambda one: one[1])
         finding = f"Anchor {worst} misses the most transmissions: {share:.1%}."

@@ -208,7 +208,6 @@ class SpiPort:
 
 
 async def _is_set(event: asyncio.Event, seconds: float) -> bool:
-    """Whether the event is set within this time."""
     with contextlib.suppress(TimeoutError):
         async with asyncio.timeout(seconds):
             await event.wait()

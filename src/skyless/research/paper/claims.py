@@ -296,7 +296,6 @@ def paper_checks(seed: int, draws: int, *, origin_s: float | None = None) -> tup
 
 
 def _draw_seed(seed: int, anchor: int) -> int:
-    """Seed of one anchor's draws."""
     return int(np.random.SeedSequence([seed, anchor]).generate_state(1, np.uint64)[0] >> 1)
 
 
@@ -666,7 +665,6 @@ _PIECES: Final = 40
 
 
 def _walk_cells(plan: Plan) -> list[Cell]:
-    """A tag that walks round its rectangle."""
     path = Waypoints(_CORNERS_M, _SPEED_MPS, loop=True, corner_s=_CORNER_S)
     tag, until_s = (path, dict.fromkeys(_METHODS, sys.maxsize)), (plan.laps + 0.5) * _LAP_S
     world = partial(listen, paper_lab_site(RADIO_PS), [tag], lab_impairments(RADIO_PS), plan.seed, until_s)
@@ -901,7 +899,6 @@ def rate_sites() -> dict[str, Site]:
 
 
 def _rate_cells(plan: Plan) -> list[Cell]:
-    """One tag at each site."""
     tags, until_s = [TagSpec(Static(3.0, 4.0))], _COUNTED_FROM_S + plan.rate_s
     return [
         Cell(f"rate/{name}", partial(receptions, site, tags, _METHODS, plan.seed, until_s), plan.rate_s * 0.05)

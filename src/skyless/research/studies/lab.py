@@ -25,7 +25,6 @@ from skyless.sim.trajectory import Static, Trajectory, Waypoints
 
 
 def _within(most: float | None) -> tuple[Limit, ...]:
-    """A limit on the ratio, or none."""
     return () if most is None else (Limit("ratio", most=most),)
 
 

@@ -586,7 +586,6 @@ def _of_days(files: Iterable[Path], span: Span) -> list[Path]:
 
 
 def _are_thinned(files: Iterable[Path]) -> bool:
-    """Whether any of the files is thinned."""
     return any(THINNED in (parquet.read_schema(file).metadata or {}) for file in files)
 
 

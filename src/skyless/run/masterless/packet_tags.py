@@ -255,7 +255,6 @@ class PacketTags:
                 link.publish(health_topic(self._settings.site, "tag", node.radio.name), health)
 
     def _update_site(self) -> None:
-        """Update the site with the positions that the tags have received."""
         heard_m = dict(self._heard_m)
         for node in self.nodes:
             heard_m |= node.tracking.anchors_m

@@ -481,7 +481,6 @@ class SurveyNode:
             self.link.forget(topic(self._settings.site_id))
 
     def _begin(self, site: Site) -> None:
-        """Start surveying a site."""
         record = record_of(self._settings.file, site, self._log)
         try:
             facts = self._facts_of(site) if self._given is None else self._given.facts

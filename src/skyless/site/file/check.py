@@ -40,7 +40,6 @@ class Limits(Struct, frozen=True):
         return math.isfinite(value) and enough and value <= self.high
 
     def __str__(self) -> str:
-        """Description for error messages."""
         noun = "a whole number" if self.whole else "a number"
         unit = f" of {self.unit}" if self.unit else ""
         if self.above:
