@@ -94,11 +94,7 @@ class BrokerSettings(Struct, frozen=True):
     """Whether it is for the program that starts it alone: its address is not stated, and its ports are unusual ones."""
 
     def check(self) -> None:
-        """Check the options for access control.
-
-        Raises:
-            SkylessError: naming the missing option.
-        """
+        """Check the options for access control. Raises SkylessError that names the missing option."""
         if (self.user is None) != (self.password is None):
             raise SkylessError(f"--user and a password in {PASSWORD_VARIABLE} belong together")
         if self.user is not None and self.roles is not None:

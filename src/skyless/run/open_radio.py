@@ -70,17 +70,15 @@ def open_radios(
     """
     driver, _, where = spec.partition(":")
     join = Join(kind, names, tuple(one.tx_ticks for one in delays or ()))
-    if driver == "ether":
-        host, port = host_and_port(spec, where, DEFAULT_PORT)
-        return EtherConnection(host, port, join).radios
     settings = delays or [AntennaDelays()] * len(names)
     phases = kind == "tag" if phases is None else phases
-    if driver == "model":
+    if driver in ("ether", "model"):
+        nodes = EtherConnection(*host_and_port(spec, where, DEFAULT_PORT), join).radios
+        if driver == "ether":
+            return nodes
         from skyless.radio.dw1000.radio import Dw1000Radio
         from skyless.run.dw1000_model import ModelPort
 
-        host, port = host_and_port(spec, where, DEFAULT_PORT)
-        nodes = EtherConnection(host, port, join).radios
         return tuple(
             Dw1000Radio(ModelPort(node, own), node.name, own, phases=phases)
             for node, own in zip(nodes, settings, strict=True)

@@ -382,11 +382,7 @@ class WholeSite:
         return f"http://{_HOST}:{self.page_port}"
 
     async def run(self) -> None:
-        """Keep everything alive until cancelled.
-
-        Raises:
-            SkylessError: the embedded broker cannot be started.
-        """
+        """Keep everything alive until cancelled. Raises SkylessError if the embedded broker cannot be started."""
         with self._ether_held, self._page_held, self._ports:
             if self.address is not None:
                 await self._run_with(self.address, None)

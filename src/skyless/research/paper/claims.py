@@ -51,7 +51,7 @@ from skyless.research.paper.plan import (
     listen,
     receptions,
 )
-from skyless.research.studies.runner import Cell
+from skyless.research.studies.runner import Cell, seed_of
 from skyless.research.uncertainty import CORRECTED, PRINTED, Chain
 from skyless.sim.evaluation.scenarios import Request, fleet_of
 from skyless.sim.impairments import DelayError, Impairments, Outage, lab_impairments
@@ -290,13 +290,9 @@ def paper_checks(seed: int, draws: int, *, origin_s: float | None = None) -> tup
     for noise in NOISES:
         for anchor in range(1, CHECKED_ANCHORS + 1):
             chain = paper_chain(seed, anchor, noise, origin_s=origin_s)
-            moments = draw_moments(chain, _draw_seed(seed, anchor), draws, uniform=noise == "uniform")
+            moments = draw_moments(chain, seed_of(seed, anchor) >> 1, draws, uniform=noise == "uniform")
             checks.extend(_checks(chain, moments, noise, anchor))
     return tuple(checks)
-
-
-def _draw_seed(seed: int, anchor: int) -> int:
-    return int(np.random.SeedSequence([seed, anchor]).generate_state(1, np.uint64)[0] >> 1)
 
 
 def _checks(chain: Chain, moments: ChainMoments, noise: str, anchor: int) -> Iterator[PaperCheck]:
@@ -433,7 +429,7 @@ def lambda_distribution(seed: int, noise: str, draws: int) -> LambdaDistribution
     edges = np.linspace(-_REACH_SIGMAS, _REACH_SIGMAS, _BINS + 1) * theory_m
     counts = np.zeros(_BINS, np.int64)
     squares = 0.0
-    for lambdas in draw_lambdas(chain, _draw_seed(seed, 1), draws, uniform=noise == "uniform"):
+    for lambdas in draw_lambdas(chain, seed_of(seed, 1) >> 1, draws, uniform=noise == "uniform"):
         values = lambdas[:, 0]
         counts += np.histogram(values, edges)[0]
         squares += float(values @ values)

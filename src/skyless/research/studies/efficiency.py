@@ -221,11 +221,7 @@ def _bound(case: Case, anchors: Array, episode: Episode, slot_s: float) -> float
 
 
 def cells(plan: Plan) -> list[Cell]:
-    """Episodes in chunks.
-
-    Raises:
-        SkylessError: the method is not one that can be fed with an episode's stamps.
-    """
+    """Episodes in chunks. Raises SkylessError if the method is not one that can be fed with an episode's stamps."""
     if plan.method != "joint":
         raise SkylessError(f"--method is {plan.method!r}; the study efficiency is about joint, whose bound it computes")
     return [

@@ -218,11 +218,7 @@ def plan_files(site: Site, file: Path) -> dict[int | None, Path]:
 
 
 def check_floor_plans(site: Site, file: Path) -> None:
-    """Check that the images of all floors are readable PNGs or JPEGs.
-
-    Raises:
-        ConfigurationError: one is not.
-    """
+    """Check that the images of all floors are readable PNGs or JPEGs. Raises ConfigurationError if one is not."""
     if site.floor_plan is not None:
         _check_image(file, "floor_plan.image", site.floor_plan.image)
     for row, floor in enumerate(() if site.floors is UNSET else site.floors):

@@ -210,11 +210,7 @@ def encode_record(record: SurveyRecord) -> bytes:
 
 
 def read_record(path: str | PathLike[str]) -> SurveyRecord:
-    """Read a survey record.
-
-    Raises:
-        ConfigurationError: the file cannot be read, or is not the record of a survey.
-    """
+    """Read a survey record. Raises ConfigurationError if the file cannot be read, or is not the record of a survey."""
     try:
         return msgspec.json.decode(Path(path).read_bytes(), type=SurveyRecord)
     except OSError as error:
