@@ -125,12 +125,12 @@ def open_sniffers(
         host, port = host_and_port(spec, where.removeprefix("//"), PHONE_PORT)
         if len(names) != 1:
             raise SkylessError(f"--radio is {spec!r}; it is one phone, which is one tag, not {len(names)}")
-        return (PhoneRadio(host, port, names[0], anchors_m or {}, AnchorFrame()),)
+        return (PhoneRadio(host, port, names[0], AnchorFrame(anchors_m)),)
     ports = zip(_ports(spec, where, _FOREIGN_BAUD, names), names, strict=True)
     if driver == "sniffer":
         return tuple(SnifferRadio(*port, name) for port, name in ports)
-    frame = AnchorFrame()  # one for all, as their tags are of one site
-    return tuple(UciRadio(*port, name, anchors_m or {}, frame) for port, name in ports)
+    frame = AnchorFrame(anchors_m)  # one for all, as their tags are of one site
+    return tuple(UciRadio(*port, name, frame) for port, name in ports)
 
 
 def _ports(spec: str, where: str, usual_baud: int, names: tuple[str, ...]) -> list[tuple[str, int]]:
