@@ -9,7 +9,6 @@ import contextlib
 import re
 import time
 from collections import deque
-from collections.abc import Callable
 from datetime import UTC, datetime
 from math import atan2, degrees, hypot
 from typing import Any, Final
@@ -88,7 +87,7 @@ def _known(**fields: object) -> Object:
 class OmloxPush(Target):
     """Sends to one hub."""
 
-    def __init__(self, url: TargetUrl, log: Callable[[str], None]) -> None:
+    def __init__(self, url: TargetUrl, context: BridgeContext) -> None:
         """Raises SkylessError."""
         super().__init__(url.text)
         scheme, host, path = url.scheme.removeprefix("omlox+"), url.host(""), url.path()
@@ -101,8 +100,8 @@ class OmloxPush(Target):
         self._address = f"{scheme}://{f'[{host}]' if ':' in host else host}:{port}{quote(path)}"
         self._token()
         if scheme == "ws" and not is_loopback(host):
-            log(f"{url.text}: positions leave this computer unencrypted; omlox+wss: encrypts")
-        self._log, self._complaints = log, RateLimit(1.0 / 60.0)
+            context.log(f"{url.text}: positions leave this computer unencrypted; omlox+wss: encrypts")
+        self._log, self._complaints = context.log, RateLimit(1.0 / 60.0)
         self._site: BridgedSite | None = None
         self._waiting: deque[Object] = deque()
 
@@ -160,6 +159,4 @@ class OmloxPush(Target):
         return {"params": {"token": read_secret(self.text, "token_file", self._token_file)}}
 
 
-def make_target(url: TargetUrl, context: BridgeContext) -> OmloxPush:
-    """Create the target of an address. Raises SkylessError."""
-    return OmloxPush(url, context.log)
+make_target: Final = OmloxPush

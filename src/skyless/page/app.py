@@ -57,7 +57,7 @@ from skyless.run.survey.checked_facts import BadFactsError
 from skyless.run.web import PAGE as LIMITS
 from skyless.run.zones import read_zones
 from skyless.site.alarm_rules import BadAlarmRulesError
-from skyless.site.file.check import image_size
+from skyless.site.file.check import image_kind, image_size
 
 if TYPE_CHECKING:
     from skyless.page.gathered import Gathered
@@ -175,17 +175,10 @@ async def _floor_plan(request: Request) -> Response:
 
 
 def _image(image: bytes | None) -> Response:
-    kind = _image_type(image) if image is not None else None
-    if image is None or kind is None:
+    kind = None if image is None else image_kind(image)
+    if kind is None:
         raise HTTPException(404, "no floor plan is known")
-    return Response(image, media_type=kind)
-
-
-def _image_type(image: bytes) -> str | None:
-    """Media type of a PNG or JPEG; None for other files, which are not served."""
-    if image.startswith(b"\x89PNG\r\n\x1a\n"):
-        return "image/png"
-    return "image/jpeg" if image.startswith(b"\xff\xd8\xff") else None
+    return Response(image, media_type=f"image/{kind}")
 
 
 async def _overlay(request: Request) -> Response:
@@ -235,7 +228,7 @@ async def _put_floor_plan(request: Request) -> Response:
     image = await read_bytes(
         request, LIMITS.floor_plan_bytes, f"the image is larger than {LIMITS.floor_plan_bytes // 10**6} MB"
     )
-    if _image_type(image) is None or image_size(image) is None:
+    if image_size(image) is None:
         raise HTTPException(400, "this is no image that can be read; it should be a PNG or JPEG")
     _live_of(request).store_floor_plan(image)
     return json_answer({"bytes": len(image)})

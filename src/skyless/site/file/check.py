@@ -399,10 +399,15 @@ def _check_times(site: Site, file: Path) -> None:
 # Images of the floor
 
 
-_PNG: Final = b"\x89PNG\r\n\x1a\n"
-_JPEG: Final = b"\xff\xd8\xff"
 _STANDALONE: Final = frozenset({0x01, *range(0xD0, 0xD8)})
 _START_OF_FRAME: Final = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
+
+
+def image_kind(data: bytes) -> str | None:
+    """``png`` or ``jpeg``, by the first bytes; None for other files."""
+    if data.startswith(b"\x89PNG\r\n\x1a\n"):
+        return "png"
+    return "jpeg" if data.startswith(b"\xff\xd8\xff") else None
 
 
 def image_size(data: bytes) -> tuple[int, int] | None:
@@ -410,12 +415,11 @@ def image_size(data: bytes) -> tuple[int, int] | None:
 
     Sources: PNG (W3C, third edition) 11.2.2, JPEG (ITU-T T.81) B.1 and B.2.2.
     """
-    if data.startswith(_PNG):
+    kind = image_kind(data)
+    if kind == "png":
         is_whole = len(data) >= 24 and data[12:16] == b"IHDR"
         return _positive(int.from_bytes(data[16:20], "big"), int.from_bytes(data[20:24], "big")) if is_whole else None
-    if data.startswith(_JPEG):
-        return _jpeg_size(data)
-    return None
+    return _jpeg_size(data) if kind == "jpeg" else None
 
 
 def _jpeg_size(data: bytes) -> tuple[int, int] | None:

@@ -28,7 +28,7 @@ from skyless.core.errors import ConfigurationError, SkylessError, writing
 from skyless.core.site import AccuracySite, AnchorSite, FloorPlanSite, Site, UnplacedAnchor
 from skyless.core.ticks import TICK_M
 from skyless.files import replace_files
-from skyless.site.file.check import SITE_LIMITS, check_site, image_size
+from skyless.site.file.check import SITE_LIMITS, check_site, image_kind, image_size
 from skyless.site.file.load import load_site, with_values
 from skyless.site.survey.facts import PairRanges, Survey, SurveyedAnchor
 
@@ -232,7 +232,6 @@ def baseline(record: SurveyRecord) -> PairRanges:
 # Files: the site file, the record next to it, and the image of the floor.
 
 _NEAR_M: Final = 1e-3
-_ENDINGS: Final = {b"\x89PNG": ".png"}
 
 
 class FloorImage(Struct, frozen=True):
@@ -346,7 +345,7 @@ def _floor_image(file: Path, site: Site, floor: FloorImage) -> tuple[str | None,
         return present, {}
     if present is not None and (file.parent / present).read_bytes() == floor.image:
         return present, {}
-    path = file.with_name(f"{file.stem}.floor{_ENDINGS.get(floor.image[:4], '.jpg')}")
+    path = file.with_name(f"{file.stem}.floor{'.png' if image_kind(floor.image) == 'png' else '.jpg'}")
     if path.exists() and path.read_bytes() != floor.image:
         path = path.with_stem(f"{path.stem}-{crc32(floor.image):08x}")
     return path.name, {path: floor.image}
