@@ -444,7 +444,6 @@ Picoseconds = Annotated[float, number(above=0.0, most=1e6)]
 Seed = Annotated[int, whole(0)]
 Method = Annotated[str, choice(*METHODS)]
 Progress = Callable[[float], None]
-"""Called now and then with the share of the work that is done, from 0 to 1."""
 
 
 def no_progress(_share: float) -> None:

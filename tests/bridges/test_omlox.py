@@ -18,7 +18,7 @@ from websockets.asyncio.server import serve
 
 from skyless.bridges import omlox
 from skyless.bridges.omlox import MAX_BATCH, OmloxPush, location
-from skyless.bridges.target import TargetUrl
+from skyless.bridges.target import BridgeContext, TargetUrl
 from skyless.core.earth import east_north_up, east_north_up_of
 from skyless.core.site import FloorSite
 from skyless.run.mqtt.messages import Asset
@@ -106,7 +106,7 @@ def test_a_hub_gets_batches_with_the_token_and_its_errors_are_told(tmp_path, mon
             port = next(iter(server.sockets)).getsockname()[1]
             zone = "A8C01D4C-333A-4406-B2E9-A174AD295CB1"
             url = TargetUrl(f"omlox+ws://127.0.0.1:{port}/v2/ws/socket?zone={zone}&token_file={token}")
-            push = OmloxPush(url, lines.append)
+            push = OmloxPush(url, BridgeContext(lines.append))
             push.on_site(HALL)
             for serial in range(1000):
                 push.on_fix(a_fix(serial=serial, position_m=(serial / 100, 2.0, 1.5)))
@@ -127,7 +127,7 @@ def test_a_hub_gets_batches_with_the_token_and_its_errors_are_told(tmp_path, mon
 
 def test_what_waits_too_long_is_dropped_oldest_first_and_counted(monkeypatch):
     monkeypatch.setattr(omlox, "MAX_WAITING", 3)
-    push = OmloxPush(TargetUrl("omlox+ws://127.0.0.1:1/v2/ws/socket"), lambda _line: None)
+    push = OmloxPush(TargetUrl("omlox+ws://127.0.0.1:1/v2/ws/socket"), BridgeContext(lambda _line: None))
     push.on_site(HALL)
     for x in range(5):
         push.on_fix(a_fix(position_m=(float(x), 0.0, 0.0)))

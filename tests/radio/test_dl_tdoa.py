@@ -20,7 +20,7 @@ FINAL = replace(POLL, kind=uci.DtMessageType.FINAL, tx_ticks=2**39, rx_ticks_tag
 
 
 def test_a_response_relays_the_poll_and_the_final_message_the_responses():
-    rounds = uci.DtRounds()
+    rounds = uci.DtRounds(uci.AnchorFrame())
     poll = rounds.on_message(POLL)
     assert poll == Packet(None, 1, poll.sequence, 2**40 - 500, 1000, ())
     one = rounds.on_message(replace(RESPONSE, flight_ticks=1280.0, initiator_reply_ticks=5000))
@@ -33,21 +33,21 @@ def test_a_response_relays_the_poll_and_the_final_message_the_responses():
 
 
 def test_a_response_that_is_reported_twice_is_relayed_once():
-    rounds = uci.DtRounds()
+    rounds = uci.DtRounds(uci.AnchorFrame())
     for message in (POLL, *[replace(RESPONSE, initiator_reply_ticks=5000)] * 2):
         rounds.on_message(message)
     assert len(rounds.on_message(FINAL).relays) == 1
 
 
 def test_a_final_message_without_responses_relays_nothing():
-    rounds = uci.DtRounds()
+    rounds = uci.DtRounds(uci.AnchorFrame())
     rounds.on_message(POLL)
     assert rounds.on_message(FINAL).relays == ()
 
 
 @pytest.mark.parametrize("states_positions", [True, False])
 def test_in_the_common_time_the_poll_arrives_one_flight_after_it_left(states_positions):
-    rounds = uci.DtRounds(None if states_positions else PLACES_M)
+    rounds = uci.DtRounds(uci.AnchorFrame(None if states_positions else PLACES_M))
     stated_m = PLACES_M if states_positions else dict.fromkeys(PLACES_M)
     rounds.on_message(replace(POLL, common_time=True, location=stated_m[1]))
     flight = dist(PLACES_M[1], PLACES_M[3]) / TICK_M
@@ -56,7 +56,7 @@ def test_in_the_common_time_the_poll_arrives_one_flight_after_it_left(states_pos
     )
     assert packet.relays == (Relay(1, packet.sequence, (2**40 - 500 + round(flight)) % 2**40, flight),)
     assert packet.position_m == stated_m[3]
-    assert uci.DtRounds().on_message(replace(RESPONSE, common_time=True)) == "message-without-poll"
+    assert uci.DtRounds(uci.AnchorFrame()).on_message(replace(RESPONSE, common_time=True)) == "message-without-poll"
 
 
 @pytest.mark.parametrize(
@@ -73,12 +73,12 @@ def test_in_the_common_time_the_poll_arrives_one_flight_after_it_left(states_pos
     ],
 )
 def test_messages_of_no_use_have_a_reason(messages, reason):
-    rounds = uci.DtRounds()
+    rounds = uci.DtRounds(uci.AnchorFrame())
     assert [rounds.on_message(message) for message in messages][-1] == reason
 
 
 def test_addresses_that_change_for_ever_hide_no_newer_position():
-    rounds = uci.DtRounds()
+    rounds = uci.DtRounds(uci.AnchorFrame())
     for address in range(3 * uci.MAX_ANCHORS_KEPT):
         rounds.on_message(replace(POLL, address=address, common_time=True, location=PLACES_M[1]))
     response = replace(RESPONSE, address=2**16, common_time=True, location=PLACES_M[2])
@@ -112,7 +112,7 @@ anything = st.builds(
 @pytest.mark.site
 @given(st.lists(anything, max_size=40))
 def test_any_messages_in_any_order(messages):
-    rounds = uci.DtRounds(PLACES_M)
+    rounds = uci.DtRounds(uci.AnchorFrame(PLACES_M))
     for message in messages:
         packet = rounds.on_message(message)
         if isinstance(packet, Packet):
@@ -123,7 +123,7 @@ def test_any_messages_in_any_order(messages):
 
 
 def test_what_is_kept_of_rounds_is_bounded():
-    rounds = uci.DtRounds()
+    rounds = uci.DtRounds(uci.AnchorFrame())
     for number in range(3 * uci.MAX_ROUNDS_AT_ONCE):
         rounds.on_message(replace(POLL, round=number))
     assert isinstance(rounds.on_message(replace(RESPONSE, round=3 * uci.MAX_ROUNDS_AT_ONCE - 1)), Packet)

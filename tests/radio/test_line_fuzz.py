@@ -101,7 +101,7 @@ class UciLine:
 
     def __init__(self):
         self.found = []
-        self.radio = UciRadio("uci", 115_200, "tag", {}, AnchorFrame())
+        self.radio = UciRadio("uci", 115_200, "tag", AnchorFrame())
         self.radio._listener = lambda event: self.found.append(getattr(event, "rx_ticks", None))
         self.radio.on_open(lambda data: None)
         self.counters = self.radio.counters

@@ -75,17 +75,17 @@ def test_measurements_that_failed_or_are_not_understood_are_counted():
         DtMeasurement(2, 1, 5, 0, 1, 1, tx_bytes=4),
     ]
     drops = Counter()
-    (packet,) = fira.DtTag(drops).on_info(SessionInfo(1, 1, 2, (*bad, poll)))
+    (packet,) = fira.DtTag(drops, uci.AnchorFrame()).on_info(SessionInfo(1, 1, 2, (*bad, poll)))
     assert drops == {"reception-failed": 1, "unknown-message": 1, "stamp-missing": 1}
     assert (packet.rx_ticks, packet.host_s) == (100, pytest.approx((2**63 + 100) / TICK_RATE_HZ))
-    (packet,) = fira.DtTag(drops).on_info(SessionInfo(1, 1, 2, (poll,)), 5.0)
+    (packet,) = fira.DtTag(drops, uci.AnchorFrame()).on_info(SessionInfo(1, 1, 2, (poll,)), 5.0)
     assert packet.host_s == 5.0
 
 
 def test_measurements_are_put_into_the_order_of_their_reception():
     response = DtMeasurement(2, 1, 5, 0, 2000, 30, responder_reply_ticks=500)
     poll = DtMeasurement(1, 0, 5, 0, 100, 2**40 - 7)
-    first, second = fira.DtTag(Counter()).on_info(SessionInfo(1, 1, 1, (response, poll)))
+    first, second = fira.DtTag(Counter(), uci.AnchorFrame()).on_info(SessionInfo(1, 1, 1, (response, poll)))
     assert (first.anchor, second.anchor, len(second.relays)) == (1, 2, 1)
 
 
@@ -96,7 +96,7 @@ def test_positions_on_the_earth_are_in_the_frame_of_the_first():
     frame = uci.AnchorFrame()
     assert frame.position_m(here) == (0.0, 0.0, 0.0)
     assert dist(frame.position_m(GeodeticPoint(latitude, longitude, height)), (30.0, -40.0, 2.5)) < 1e-3
-    tag = fira.DtTag(Counter())
+    tag = fira.DtTag(Counter(), uci.AnchorFrame())
 
     def heard(address, point):
         one = DtMeasurement(
@@ -203,7 +203,7 @@ def test_random_lines_never_raise(reader):
 @pytest.mark.parametrize("stated", ["messages", "common time"])
 def test_two_sessions_that_take_turns_are_kept_apart(stated):
     """Their blocks and rounds have the same numbers."""
-    tag, relays = fira.DtTag(Counter()), []
+    tag, relays = fira.DtTag(Counter(), uci.AnchorFrame()), []
     polls = [DtMeasurement(anchor, 0, 5, 0, 100, 1000 + anchor) for anchor in (1, 11)]
     responses = [
         DtMeasurement(anchor, 1, 5, 0, 2000, 2000 + anchor, responder_reply_ticks=500, flight_ticks=64)
@@ -224,7 +224,7 @@ def test_one_frame_has_one_kind_of_positions_and_several_tags_share_it():
     assert frame.position_m(None) is None
     assert frame.position_m(here) == (0.0, 0.0, 0.0)
     assert frame.position_m((1.0, 2.0, 3.0)) is None
-    first, second = fira.DtTag(Counter(), None, frame), fira.DtTag(Counter(), None, frame)
+    first, second = fira.DtTag(Counter(), frame), fira.DtTag(Counter(), frame)
     one = DtMeasurement(1, 0, 1, 0, 0, 0, location_kind=1, location=encode_wgs84(there))
     first_m, second_m = (tag.on_info(SessionInfo(1, 1, 1, (one,)))[0].position_m for tag in (first, second))
     assert first_m == second_m

@@ -32,7 +32,7 @@ class Stage(PhoneRadio):
     """A radio that runs, and a tag that receives from it."""
 
     def __init__(self, port=0):
-        super().__init__("127.0.0.1", port, "walker", {}, AnchorFrame())
+        super().__init__("127.0.0.1", port, "walker", AnchorFrame())
         self.events, self.fixes, self.said, self.faults = [], [], [], []
         settings = PacketTagSettings({}, publish_hz=1e9)
         self.node = PacketTagNode(settings, self, self.fixes.append, self.said.append)

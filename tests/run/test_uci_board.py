@@ -104,7 +104,7 @@ def test_a_flight_that_the_line_has_no_bits_for_is_unknown(x_m, ticks):
 
 
 def test_a_board_that_restarts_may_receive_anchors_at_another_height():
-    radio = UciRadio("/dev/ttyACM0", 115_200, "tag1", {}, AnchorFrame())
+    radio = UciRadio("/dev/ttyACM0", 115_200, "tag1", AnchorFrame())
     node = PacketTagNode(PacketTagSettings({}, auto_height=True), radio, print, print, lambda: 0.0)
     corners_m = [(0.0, 0.0), (6.0, 0.0), (6.0, 8.0), (0.0, 8.0)]
     for height_m in (2.0, 5.0):

@@ -15,7 +15,7 @@ from msgspec.structs import replace
 from skyless.core.site import AccuracySite
 from skyless.core.ticks import TICK_BITS
 from skyless.radio.foreign.fira import DtTag
-from skyless.radio.foreign.uci import UciReader
+from skyless.radio.foreign.uci import AnchorFrame, UciReader
 from skyless.run.board import UciProtocol
 from skyless.run.masterless.packet_tracking import DL_TDOA, DL_TDOA_ONE_WAY, PacketTracking
 from skyless.sim.evaluation.fleet import world_of
@@ -102,7 +102,7 @@ class Tag:
     def __init__(self, version):
         drops, self._stream = Counter(), bytearray()
         self._board = UciProtocol(self._hear, version)
-        self._reader, self._tag = UciReader(drops), DtTag(drops)
+        self._reader, self._tag = UciReader(drops), DtTag(drops, AnchorFrame())
         one_way = DL_TDOA_ONE_WAY.changed(**KNOWN)
         self._tracking = PacketTracking(DL_TDOA.changed(**KNOWN), {}, TICK_BITS, one_way=one_way)
 

@@ -35,7 +35,6 @@ LAST_S: Final = 3.0
 """For everything that waits when the bridge stops."""
 
 _MAX_KNOWN: Final = 10_000
-_MAX_SECRET_BYTES: Final = 4096
 _OTHERS: Final = 0o077
 
 What = Literal["raised", "ended", "acknowledged"]
@@ -173,7 +172,6 @@ class AlarmTarget(Target):
 
 
 def _states(alarm: AlarmMessage) -> list[What]:
-    """The changes of an alarm so far."""
     states: list[What] = ["raised"]
     if alarm.acknowledged_unix_s is not None:
         states.append("acknowledged")
@@ -214,7 +212,7 @@ def read_secret(text: str, key: str, name: str) -> str:
     try:
         with path.open("rb") as file:
             mode = os.fstat(file.fileno()).st_mode & 0o777
-            secret = file.read(_MAX_SECRET_BYTES).decode(errors="replace").partition("\n")[0].strip()
+            secret = file.read(4096).decode(errors="replace").partition("\n")[0].strip()
     except OSError as error:
         raise SkylessError(f"the target {text!r} has {key}={name}, which cannot be read: {error.strerror}") from None
     if mode & _OTHERS or not secret:

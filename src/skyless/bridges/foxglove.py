@@ -315,7 +315,6 @@ class FoxgloveTarget(Target):
         return connection.respond(HTTPStatus.FORBIDDEN, text)
 
     async def _serve(self, connection: ServerConnection) -> None:
-        """Serve one client until it leaves."""
         if len(self._sessions) >= LIMITS.clients:
             self.dropped["too-many-clients"] += 1
             return

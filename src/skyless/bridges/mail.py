@@ -100,6 +100,4 @@ def _time(unix_s: float) -> str:
         return f"{unix_s:g} s, which is no time"
 
 
-def make_target(url: TargetUrl, context: BridgeContext) -> Mail:
-    """Create the target of an address. Raises SkylessError."""
-    return Mail(url, context)
+make_target: Final = Mail

@@ -25,7 +25,6 @@ from skyless.core.motion_sample import MotionSample, ShortestLatency
 PORT: Final = 7011
 MAVLINK_PORT: Final = 14_551
 
-_MAX_LINE_BYTES: Final = 1 << 12
 _OTHER_TIME_S: Final = 5.0
 """Samples farther from the present are of a clock that is not set, or simulated."""
 
@@ -90,7 +89,7 @@ class MotionFeed:
                     lambda: _Datagrams(self.feed_mavlink), (self._host, self.port)
                 )
             else:
-                self.server = await asyncio.start_server(self._serve, self._host, self.port, limit=_MAX_LINE_BYTES)
+                self.server = await asyncio.start_server(self._serve, self._host, self.port, limit=1 << 12)
         except (OSError, UnicodeError) as error:
             raise SkylessError(f"--motion cannot listen on {self._host}:{self.port}: {error}") from None
         try:

@@ -9,7 +9,6 @@ import contextlib
 import re
 import time
 from collections import deque
-from collections.abc import Callable
 from datetime import UTC, datetime
 from math import atan2, degrees, hypot
 from typing import Any, Final
@@ -37,9 +36,7 @@ MAX_BATCH: Final = 100
 MAX_WAITING: Final = 10_000
 """Most locations waiting for the hub; beyond it the oldest is dropped."""
 
-_GATHER_S: Final = 0.05
 _PAUSE_S: Final = 2.0
-_COMPLAINTS_HZ: Final = 1.0 / 60.0
 _UUID: Final = re.compile(r"[0-9A-Fa-f]{8}(-[0-9A-Fa-f]{4}){3}-[0-9A-Fa-f]{12}")
 
 
@@ -84,14 +81,13 @@ def location(fix: FixMessage, site: BridgedSite, source: str) -> Object:
 
 
 def _known(**fields: object) -> Object:
-    """The fields with a value."""
     return {key: value for key, value in fields.items() if value is not None}
 
 
 class OmloxPush(Target):
     """Sends to one hub."""
 
-    def __init__(self, url: TargetUrl, log: Callable[[str], None]) -> None:
+    def __init__(self, url: TargetUrl, context: BridgeContext) -> None:
         """Raises SkylessError."""
         super().__init__(url.text)
         scheme, host, path = url.scheme.removeprefix("omlox+"), url.host(""), url.path()
@@ -104,8 +100,8 @@ class OmloxPush(Target):
         self._address = f"{scheme}://{f'[{host}]' if ':' in host else host}:{port}{quote(path)}"
         self._token()
         if scheme == "ws" and not is_loopback(host):
-            log(f"{url.text}: positions leave this computer unencrypted; omlox+wss: encrypts")
-        self._log, self._complaints = log, RateLimit(_COMPLAINTS_HZ)
+            context.log(f"{url.text}: positions leave this computer unencrypted; omlox+wss: encrypts")
+        self._log, self._complaints = context.log, RateLimit(1.0 / 60.0)
         self._site: BridgedSite | None = None
         self._waiting: deque[Object] = deque()
 
@@ -142,7 +138,7 @@ class OmloxPush(Target):
                     self.dropped["not-sent"] += len(batch)
                     raise
             if not self._waiting:
-                await asyncio.sleep(_GATHER_S)
+                await asyncio.sleep(0.05)
 
     async def _receive(self, hub: ClientConnection) -> None:
         async for answer in hub:
@@ -163,6 +159,4 @@ class OmloxPush(Target):
         return {"params": {"token": read_secret(self.text, "token_file", self._token_file)}}
 
 
-def make_target(url: TargetUrl, context: BridgeContext) -> OmloxPush:
-    """Create the target of an address. Raises SkylessError."""
-    return OmloxPush(url, context.log)
+make_target: Final = OmloxPush

@@ -162,9 +162,8 @@ class SiteMetrics:
 
     def on_health(self, health: TagHealth | AnchorHealth) -> None:
         """Count what a tag or an anchor states, which the table has."""
-        is_tag = isinstance(health, TagHealth)
-        node = self._known("tag", health.tag) if isinstance(health, TagHealth) else None
-        node = node if is_tag else self._known("anchor", str(getattr(health, "anchor", "")))
+        kind, name = ("tag", health.tag) if isinstance(health, TagHealth) else ("anchor", str(health.anchor))
+        node = self._known(kind, name)
         if node is not None:
             node.on_health(health)
 
@@ -312,8 +311,6 @@ def _totals(plain: _Plain, nodes: _Nodes) -> Iterator[Metric]:
 
 
 class _Scrape(Collector):
-    """The metrics of one scrape."""
-
     def __init__(self, families: Iterable[Metric]) -> None:
         self._families = families
 

@@ -365,7 +365,6 @@ def _copy(
 
 
 def _messages_of(found: Recorded, encoder: RosEncoder, tag: str | None) -> list[RosMessage]:
-    """The ROS messages of one recorded message."""
     message = found.message
     if isinstance(message, SiteMessage):
         return encoder.on_site(bridged_site(message.site, simulated=message.simulated))

@@ -83,11 +83,7 @@ def floored(covariance_m2: Matrix) -> Matrix:
 
 
 def require_georeference(site: BridgedSite, target: str) -> GeoreferenceSite:
-    """The site's georeference, for a target with global positions.
-
-    Raises:
-        SkylessError: the site has none.
-    """
+    """The site's georeference, for a target with global positions. Raises SkylessError if the site has none."""
     if site.georeference is None:
         raise SkylessError(
             f"{target} gives positions on the Earth, and site {site.id} ({site.name}) does not say where it is: its "

@@ -29,8 +29,6 @@ from skyless.run.web import BRIDGES as LIMITS
 _WAITING_BYTES: Final = 1 << 15
 """Most bytes waiting for one reader in this process, or a single longer message; and as many in the system."""
 
-_MAX_DATAGRAM_BYTES: Final = 1 << 16
-
 _STUCK_S: Final = 5.0
 """A TCP reader that has accepted nothing for this time is disconnected."""
 
@@ -166,7 +164,7 @@ class UdpSender:
 
     def _read(self, received: Callable[[bytes], None]) -> None:
         with contextlib.suppress(OSError):  # nothing to read after all, or what was sent found nobody
-            received(self._socket.recv(_MAX_DATAGRAM_BYTES))
+            received(self._socket.recv(1 << 16))
 
 
 class PtySender:

@@ -332,7 +332,6 @@ def check_picture(plot: Path | None) -> None:
 
 _HIDDEN_S: Final = 1.5
 _REDRAW_S: Final = 0.1
-_STATUS_S: Final = 0.5
 _LINE_S: Final = 5.0
 
 
@@ -397,4 +396,4 @@ async def with_status(work: Coroutine[Any, Any, None], words: Callable[[], str])
     from skyless.run.process import every, outlasting
 
     with status("") as show:
-        await outlasting(every(_STATUS_S, lambda: show(words())), work)
+        await outlasting(every(0.5, lambda: show(words())), work)

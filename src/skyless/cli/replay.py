@@ -158,7 +158,6 @@ _REASONS: Final = {
 
 
 def _warn_of_unknown(name: str, report: "ReplayReport") -> None:
-    """Warn if much of a recording is from unknown anchors."""
     unknown = report.drops.get("unknown-anchor", 0)
     if report.fixes and unknown >= _MANY_UNKNOWN * report.receptions:
         share = f"{unknown} of {report.receptions} receptions ({unknown / report.receptions:.0%})"

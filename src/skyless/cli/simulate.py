@@ -81,7 +81,6 @@ def simulate(*, asked: SimulateOptions, output: _Output) -> int:
 
 
 def _why_none(result: "FleetReport", simulation: "Simulation") -> str:
-    """Why no fix was judged."""
     from skyless.core.geometry import RADIO_REACH_M
     from skyless.site.file.advice import too_few_anchors
 

@@ -207,7 +207,6 @@ def _report_new(asked: _KeysOptions, chain: Chain, next_steps: str, warnings: Se
 
 
 def _report(folder: Path, public: SitePublic, chains: list[Chain], now_s: float) -> dict[str, Any]:
-    """Report on the key chains."""
     present = ChainRing(chains).serial_at(now_s)
     present = None if present is None or present < public.least_serial else present
     left_s = chains[-1].ends_s - now_s
@@ -262,7 +261,6 @@ def _successor(folder: Path, public: SitePublic, chains: list[Chain], starts_s: 
 
 
 def _made(public: SitePublic, serial: int, starts_s: float, years: float, private: bytes) -> Chain:
-    """Make a new chain, with a progress bar."""
     with progress_bar("making the key chain") as reach:
         return new_chain(public.site, serial, starts_s, starts_s + years * _YEAR_S, private, reach)
 

@@ -297,8 +297,6 @@ def paper(*, out: Path, seed: Seed = 1, quick: bool = False, output: JsonOptions
     console().print(f"{report.report}: {len(report.figures)} pictures and numbers.json next to it")
 
 
-_QUICK_S: Final = 12.0
-
 benchmark_app = App(name="benchmark", help_epilogue="Example: skyless benchmark recordings --quick --out compared")
 
 
@@ -355,7 +353,7 @@ def benchmark(folder: Path, /, *, asked: BenchmarkOptions, output: JsonOptions) 
         raise SkylessError(f"FOLDER is {str(folder)!r}; it should hold recordings that skyless replay can read")
     kept = asked.out / "results"
     make_folder("--out", kept)
-    first_s = _QUICK_S if asked.quick and asked.first_s is None else asked.first_s
+    first_s = 12.0 if asked.quick and asked.first_s is None else asked.first_s
     own = asked.estimator
     estimators = {} if own is None else {getattr(own, "__name__", "own"): own}
     code = getattr(getattr(own, "hear", own), "__code__", None)

@@ -270,8 +270,6 @@ def _tapes(tapes: Sequence["TapeAdvice"]) -> list[str]:
 
 # At a running site
 
-_USUAL_S: Final = 30.0
-
 
 def _gather_live(asked: LiveOptions, known: SurveyOptions) -> "tuple[Site, Callable[[], PairRanges], PairRanger]":
     """Gather ranges for some seconds: the site, its anchors' ranges, and their source. Raises SkylessError."""
@@ -294,7 +292,7 @@ async def _serve(asked: LiveOptions, known: SurveyOptions) -> None:
 
 
 async def _gather(asked: LiveOptions, known: SurveyOptions, found: "list[SurveyNode]") -> None:
-    seconds = asked.duration or _USUAL_S
+    seconds = asked.duration or 30.0
     with contextlib.suppress(TimeoutError):
         async with asyncio.timeout(seconds + 1.0):  # a moment for the broker and the anchors to answer
             node = await _node(asked, known, serves=False)

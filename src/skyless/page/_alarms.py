@@ -34,8 +34,6 @@ MAX_SENT: Final = 500
 KEPT_WAIT_S: Final = 2.0
 """Time after connecting by which the broker's retained messages have arrived."""
 
-_BROADCAST_S: Final = 0.25
-
 
 class NoAlarmError(Exception):
     """There is no such alarm."""
@@ -180,7 +178,7 @@ class SiteAlarms:
             if what != "updated":
                 self._log(what, message, now_s)
             self._publish(message, dropped=what == "dropped")
-        if self._changed and now_s - self._sent_s >= _BROADCAST_S:
+        if self._changed and now_s - self._sent_s >= 0.25:
             self._changed, self._sent_s = False, now_s
             self._broadcast("alarms", self.encoded()["alarms"])
 

@@ -57,7 +57,7 @@ from skyless.run.survey.checked_facts import BadFactsError
 from skyless.run.web import PAGE as LIMITS
 from skyless.run.zones import read_zones
 from skyless.site.alarm_rules import BadAlarmRulesError
-from skyless.site.file.check import image_size
+from skyless.site.file.check import image_kind, image_size
 
 if TYPE_CHECKING:
     from skyless.page.gathered import Gathered
@@ -175,17 +175,10 @@ async def _floor_plan(request: Request) -> Response:
 
 
 def _image(image: bytes | None) -> Response:
-    kind = _image_type(image) if image is not None else None
-    if image is None or kind is None:
+    kind = None if image is None else image_kind(image)
+    if kind is None:
         raise HTTPException(404, "no floor plan is known")
-    return Response(image, media_type=kind)
-
-
-def _image_type(image: bytes) -> str | None:
-    """Media type of a PNG or JPEG; None for other files, which are not served."""
-    if image.startswith(b"\x89PNG\r\n\x1a\n"):
-        return "image/png"
-    return "image/jpeg" if image.startswith(b"\xff\xd8\xff") else None
+    return Response(image, media_type=f"image/{kind}")
 
 
 async def _overlay(request: Request) -> Response:
@@ -235,7 +228,7 @@ async def _put_floor_plan(request: Request) -> Response:
     image = await read_bytes(
         request, LIMITS.floor_plan_bytes, f"the image is larger than {LIMITS.floor_plan_bytes // 10**6} MB"
     )
-    if _image_type(image) is None or image_size(image) is None:
+    if image_size(image) is None:
         raise HTTPException(400, "this is no image that can be read; it should be a PNG or JPEG")
     _live_of(request).store_floor_plan(image)
     return json_answer({"bytes": len(image)})
@@ -352,7 +345,6 @@ async def _live(socket: WebSocket) -> None:
 # Running the dashboard: its socket, its work, and its shutdown.
 
 PORT: Final = 8080
-_MORE_PORTS: Final = 50
 _PING_S: Final = 5.0
 _GRACE_S: Final = 0.4
 _SEND_BUFFER_BYTES: Final = 262_144  # data for a slow page that waits in the kernel and is sent before anything newer
@@ -366,7 +358,7 @@ def bind(host: str, port: int | None) -> socket.socket:
     """
     if port is not None:
         return _bind(host, port)
-    for number in range(PORT, PORT + _MORE_PORTS):
+    for number in range(PORT, PORT + 50):
         held = reserve(host, number)
         if held is None:  # reserved by a demo that is starting
             continue

@@ -142,7 +142,6 @@ class View(Struct, frozen=True):
     """Numbers of tags whose names are requested."""
 
     def __post_init__(self) -> None:
-        """Raise ValueError if the view has no area."""
         x0, y0, x1, y1 = self.view
         if not (x0 < x1 and y0 < y1):
             raise ValueError("it has no area")
@@ -246,7 +245,6 @@ class Gathered:
             await client.close()
 
     async def _read(self, client: Client, site: int, live: LiveSite) -> None:
-        """Read the batches of a site until cancelled."""
         self._sites[site] = Columns()
         reading = await client.subscribe(subjects.at(subjects.FIXES, site), cb=self._on_batch)
         try:

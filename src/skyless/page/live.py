@@ -296,7 +296,6 @@ class LiveSite:
 
     @property
     def _dashboards(self) -> list[StatusMessage]:
-        """Statuses of the site's dashboards."""
         return [node.status for node in self.table.all("dashboard").values() if node.status is not None]
 
     def _read_zones(self, payload: bytes) -> ZonesMessage:

@@ -20,7 +20,6 @@ from skyless.site.planning.maps import MAX_PREDICTED, Grid, PlanSettings, Predic
 MAX_CELLS: Final = 40_000
 _STEPS_M: Final = (0.05, 0.1, 0.2, 0.25, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0)
 
-_MAX_CACHED: Final = 8
 _MIN_FIX_SHARE: Final = 0.5
 
 
@@ -49,7 +48,7 @@ def overlay(task: OverlayTask) -> dict[str, Any]:
     }
 
 
-@lru_cache(_MAX_CACHED)
+@lru_cache(8)
 def _grids(task: bytes) -> tuple[Grid, dict[str, list[float | None]]]:
     """PDOP, HDOP and predicted sigma row by row from the lowest y; None where there is no fix."""
     asked = msgspec.json.decode(task, type=OverlayTask)

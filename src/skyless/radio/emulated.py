@@ -145,7 +145,6 @@ def this_machine() -> str:
         return ""
 
 
-_RECONNECT_S: Final = 0.2
 _SHIFT_S: Final = 15.0
 """The offset to another machine's clock is measured again after this: computers' clocks drift by 0.1 ms a second."""
 _RECEIVE_BUFFER_BYTES: Final = 1 << 16
@@ -252,7 +251,7 @@ class EtherConnection:
             if reason != reported:
                 reported = reason
                 self._notify_all(Gone(reason))
-            await asyncio.sleep(_RECONNECT_S)
+            await asyncio.sleep(0.2)
 
     def on_joined(self, message: Joined, shift_s: float, transport: asyncio.Transport) -> None:
         """The nodes have joined the air."""

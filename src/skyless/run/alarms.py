@@ -151,10 +151,7 @@ class AlarmEngine:
     """The alarms of one site. ``tick`` returns the changes since the last call."""
 
     def __init__(
-        self,
-        monitor: ZoneMonitor,
-        table: SiteTable,
-        local_time: Callable[[float], time.struct_time] = time.localtime,
+        self, monitor: ZoneMonitor, table: SiteTable, local_time: Callable[[float], time.struct_time] = time.localtime
     ) -> None:
         """``monitor`` and ``table`` get the same fixes; the monitor's events are passed in.
 

@@ -378,7 +378,6 @@ class Anchors:
             self._keys.warn(time.time())
 
     def _publish_stamps(self) -> None:
-        """Publish the stamps that were requested and are due."""
         for node, link in zip(self.nodes, self._links, strict=True):
             if link is not None and (message := node.stamps.collect(time.monotonic(), time.time())) is not None:
                 link.publish(stamps_topic(self._site.id, node.id), message, qos=1)

@@ -42,14 +42,11 @@ _PORTS_TO_TRY: Final = 100
 _TEMPORARY: Final = "skyless-broker-"  # prefix of temporary folders' names
 
 _NATS_HOST: Final = "127.0.0.1"
-_SEND_AGAIN: Final = "3s"  # when a message that a dying subscriber has not acknowledged is sent again; 30 s by default
 
 _ABANDONED_S: Final = 10.0  # a temporary folder of this age that is not locked was left by a killed broker
 
 _START_S: Final = 20.0
 _POLL_S: Final = 0.02
-_ATTEMPTS: Final = 20
-_WAIT_S: Final = 0.01
 
 
 class BrokerLimits(Struct, frozen=True):
@@ -97,11 +94,7 @@ class BrokerSettings(Struct, frozen=True):
     """Whether it is for the program that starts it alone: its address is not stated, and its ports are unusual ones."""
 
     def check(self) -> None:
-        """Check the options for access control.
-
-        Raises:
-            SkylessError: naming the missing option.
-        """
+        """Check the options for access control. Raises SkylessError that names the missing option."""
         if (self.user is None) != (self.password is None):
             raise SkylessError(f"--user and a password in {PASSWORD_VARIABLE} belong together")
         if self.user is not None and self.roles is not None:
@@ -137,7 +130,8 @@ class BrokerSettings(Struct, frozen=True):
 def _configuration(settings: BrokerSettings, port: int, data: Path, nats: NatsAddress | None = None) -> str:
     """Return nats-server's configuration file; its format accepts JSON. ``nats`` is the address for a gather."""
     host = f"[{settings.listen}]" if ":" in settings.listen else settings.listen
-    mqtt: dict[str, object] = {"listen": f"{host}:{port}", "ack_wait": _SEND_AGAIN}
+    # A message that a dying subscriber has not acknowledged is sent again after ``ack_wait``; 30 s by default.
+    mqtt: dict[str, object] = {"listen": f"{host}:{port}", "ack_wait": "3s"}
     if settings.certificate is not None:
         mqtt["tls"] = {"cert_file": str(settings.certificate), "key_file": str(settings.key)}
     if settings.strangers_read:
@@ -466,8 +460,8 @@ def _locked(file: Path) -> IO[str]:
     Raises:
         OSError: it cannot be written, or another broker states its address there.
     """
-    for attempt in range(_ATTEMPTS):
-        time.sleep(_WAIT_S if attempt else 0.0)
+    for attempt in range(20):
+        time.sleep(0.01 if attempt else 0.0)
         with contextlib.suppress(BlockingIOError, FileNotFoundError):
             lock = locked(file)
             if os.path.samestat(os.fstat(lock.fileno()), file.stat()):

@@ -201,7 +201,6 @@ class BoardProbe:
 _PORTS: Final = ("ttyACM*", "ttyUSB*")
 _TIMEX: Final = "@Illl"
 """First fields of Linux's ``struct timex``: modes, offset, freq, maxerror."""
-_TIMEX_BYTES: Final = 512  # more than it has
 _TIME_ERROR: Final = 5
 
 
@@ -229,7 +228,7 @@ def clock_check() -> Check:
     """Check whether the system reports that its clock is being synchronised (``adjtimex``)."""
     if not sys.platform.startswith("linux"):
         return Check("clock", "not checked", "This system does not say whether its clock is synchronised.")
-    timex = ctypes.create_string_buffer(_TIMEX_BYTES)
+    timex = ctypes.create_string_buffer(512)  # more than it has
     state = ctypes.CDLL(None, use_errno=True).adjtimex(timex)
     if state < 0:
         return Check("clock", "not checked", f"adjtimex: {os.strerror(ctypes.get_errno())}.")

@@ -321,11 +321,7 @@ class EtherNode:
         self._link = link_of(address, "air", site=self._site, kind="ether")
 
     async def run(self) -> None:
-        """Serve until cancelled.
-
-        Raises:
-            OSError: the address cannot be listened on.
-        """
+        """Serve until cancelled. Raises OSError if the address cannot be listened on."""
         server = await self._ether.serve(self._host, self._port, self._log)
         host, port = server.sockets[0].getsockname()[:2]
         self._log(f"ether at {f'[{host}]' if ':' in host else host}:{port}")

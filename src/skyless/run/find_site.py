@@ -155,7 +155,6 @@ async def watch_sites(
 async def _watch_connected(
     address: MqttAddress, on_sites: Callable[[list[SiteOnBroker]], None], on_state: Callable[[bool], None]
 ) -> None:
-    """Watch until the connection is lost."""
     known = KnownSites()
     who, react = Introduction("", _KEEPALIVE_S), Reactions(message=known.add)
     connection = await open_connection(address, address.tls_context(), who, react)

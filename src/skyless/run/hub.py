@@ -191,7 +191,6 @@ async def refuse_second(leaf: Leaf, address: NatsAddress, log: Log) -> None:
 # another's messages. A source requests its site's subjects, but the site's server may ignore that, so readers filter by
 # those subjects again.
 
-_READY_S: Final = 60.0
 _RETRY_S: Final = 1.0
 _NAMES_BYTES: Final = 30_000_000
 _STATE_BYTES: Final = 100_000_000
@@ -244,7 +243,7 @@ async def make_streams_of(hub: Hub, tenant: str, log: Log) -> dict[int, Summary 
     """
     address, say = hub.address(tenant), rarely(lambda trouble: log(f"waits for the hub: {trouble}"))
     try:
-        async with asyncio.timeout(_READY_S):
+        async with asyncio.timeout(60.0):
             client = await connect(address, "skyless hub", say, Counter())
             while True:
                 try:

@@ -337,7 +337,6 @@ UNVERIFIED_S: Final = 10.0
 
 DAY_S: Final = 86_400.0
 LITTLE_LEFT_S: Final = 60.0 * DAY_S
-_MAX_MEMORY_BYTES: Final = 1 << 16
 _WRONG: Final = (Fault.BAD_CODE, Fault.LATE, Fault.EARLY)
 
 _NOT_ACCEPTED: Final = {
@@ -498,7 +497,7 @@ class TagMemory:
     def _read(self) -> Remembered:
         try:
             with self.file.open("rb") as file:
-                read = msgspec.json.decode(file.read(_MAX_MEMORY_BYTES), type=Remembered)
+                read = msgspec.json.decode(file.read(1 << 16), type=Remembered)
         except (OSError, msgspec.MsgspecError):
             return Remembered()
         if not 0 <= read.serial <= MAX_SERIAL or any(len(one) != CERTIFICATE_BYTES for one in read.certificates):

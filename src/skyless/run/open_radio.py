@@ -70,17 +70,15 @@ def open_radios(
     """
     driver, _, where = spec.partition(":")
     join = Join(kind, names, tuple(one.tx_ticks for one in delays or ()))
-    if driver == "ether":
-        host, port = host_and_port(spec, where, DEFAULT_PORT)
-        return EtherConnection(host, port, join).radios
     settings = delays or [AntennaDelays()] * len(names)
     phases = kind == "tag" if phases is None else phases
-    if driver == "model":
+    if driver in ("ether", "model"):
+        nodes = EtherConnection(*host_and_port(spec, where, DEFAULT_PORT), join).radios
+        if driver == "ether":
+            return nodes
         from skyless.radio.dw1000.radio import Dw1000Radio
         from skyless.run.dw1000_model import ModelPort
 
-        host, port = host_and_port(spec, where, DEFAULT_PORT)
-        nodes = EtherConnection(host, port, join).radios
         return tuple(
             Dw1000Radio(ModelPort(node, own), node.name, own, phases=phases)
             for node, own in zip(nodes, settings, strict=True)
@@ -127,12 +125,12 @@ def open_sniffers(
         host, port = host_and_port(spec, where.removeprefix("//"), PHONE_PORT)
         if len(names) != 1:
             raise SkylessError(f"--radio is {spec!r}; it is one phone, which is one tag, not {len(names)}")
-        return (PhoneRadio(host, port, names[0], anchors_m or {}, AnchorFrame()),)
+        return (PhoneRadio(host, port, names[0], AnchorFrame(anchors_m)),)
     ports = zip(_ports(spec, where, _FOREIGN_BAUD, names), names, strict=True)
     if driver == "sniffer":
         return tuple(SnifferRadio(*port, name) for port, name in ports)
-    frame = AnchorFrame()  # one for all, as their tags are of one site
-    return tuple(UciRadio(*port, name, anchors_m or {}, frame) for port, name in ports)
+    frame = AnchorFrame(anchors_m)  # one for all, as their tags are of one site
+    return tuple(UciRadio(*port, name, frame) for port, name in ports)
 
 
 def _ports(spec: str, where: str, usual_baud: int, names: tuple[str, ...]) -> list[tuple[str, int]]:

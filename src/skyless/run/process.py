@@ -410,7 +410,6 @@ _LONGEST_RESTART_S: Final = 5.0
 _GOOD_RUN_S: Final = 10.0  # a program that has run for this time was not faulty from the start
 
 _STOP_S: Final = 5.0
-_LINES: Final = 20
 _LINE_BYTES: Final = 500
 _COMMAND: Final = (sys.executable, "-m", "skyless.cli.main")
 
@@ -451,7 +450,7 @@ class Child:
         self.pid: int | None = None  # of the running process
         self._log = log
         self._is_asked = False
-        self._last_lines: deque[str] = deque(maxlen=_LINES)
+        self._last_lines: deque[str] = deque(maxlen=20)
         self._line = b""
 
     def restart(self) -> None:

@@ -275,7 +275,6 @@ class Tag:
             self.link.publish(self._fix_topic, message, until_s=self.node.fix_log.due_s + FIX_LEAVES_S)
 
     def _connect(self) -> None:
-        """Make the link to the site to which the tag listens."""
         site = self.node.receiver.site
         if self._address is None or site is None or site == self._site:
             return

@@ -363,8 +363,6 @@ class Tape:
 
 
 class _Beacons:
-    """The contents of a site's beacons."""
-
     def __init__(self, site: Site) -> None:
         self._site, self._pages = site.id, tuple(map(_on_air, site_pages_of(site)))
         self._issue = site_issue(self._pages)

@@ -62,7 +62,6 @@ def figures(values: Any) -> Array:  # noqa: ANN401 - whatever has numbers and No
 
 
 _UNKNOWN: Final = (np.nan, np.nan, np.nan)
-_COLUMNS: Final = 26
 
 
 class Fixes(Struct, frozen=True, eq=False):
@@ -181,7 +180,7 @@ class FixRecorder:
 
     def fixes(self) -> Fixes:
         """All fixes so far."""
-        rows = np.array(self._numbers).reshape(-1, _COLUMNS)
+        rows = np.array(self._numbers).reshape(-1, 26)
         rows.setflags(write=False)
         return Fixes(
             tags=self._tags,
@@ -204,7 +203,6 @@ class FixRecorder:
 # An estimator's input from a recording as arrays, one row per reception or time difference.
 
 _NONE: Final = -1
-_WHOLE: Final = 7
 
 
 class Measurements(Struct, frozen=True, eq=False):
@@ -276,7 +274,7 @@ class MeasurementRecorder:
 
     def measurements(self) -> Measurements:
         """All measurements so far."""
-        whole = np.array(self._whole, dtype=np.int64).reshape(-1, _WHOLE)
+        whole = np.array(self._whole, dtype=np.int64).reshape(-1, 7)
         numbers = np.array(self._numbers).reshape(-1, 2)
         for rows in (whole, numbers):
             rows.setflags(write=False)

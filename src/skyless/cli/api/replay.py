@@ -12,7 +12,7 @@ from msgspec.structs import replace
 
 from skyless.arguments import python_function, wrong
 from skyless.cli.api.fixes import Fixes, FixRecorder, MeasurementRecorder, Measurements, Result
-from skyless.cli.common import cm
+from skyless.cli.common import cm, number
 from skyless.core.air.masterless_packets import Packet, PairTdoa, Point
 from skyless.core.arrays import Matrix
 from skyless.core.errors import ConfigurationError, SkylessError
@@ -113,7 +113,7 @@ class ReplayResult(Result, frozen=True, eq=False, kw_only=True):
         yield "receptions", f"{report.receptions}"
         yield "fixes", f"{report.fixes}" if report.reason is None else f"none: {report.reason}"
         yield "method", f"{report.method}" + (f", given {report.measurements}" if report.measurements else "")
-        yield "rate", "–" if report.rate_hz is None else f"{report.rate_hz:.1f} Hz"
+        yield "rate", number(report.rate_hz, "{:.1f} Hz")
         note = self.height_note
         yield "height", note if report.height_m is None else f"{report.height_m:.3f} m, {note}"
         yield "median position", _triple(report.median_m)
@@ -139,7 +139,7 @@ def _judged_facts(report: ReplayReport) -> Iterator[tuple[str, str]]:
     if report.first_fix_s is not None:
         off = "" if report.first_fix_error_m is None else f", {cm(report.first_fix_error_m)} off"
         yield "first fix", f"after {report.first_fix_s:.2f} s{off}"
-        yield "available", _share(report.availability)
+        yield "available", number(report.availability, "{:.1f} %", 100.0)
     left_out = ", ".join(f"{count} {reason}" for reason, count in report.left_out.items())
     yield "judged", f"{report.judged} fixes, {report.judged_s:.1f} s" + (f" (left out: {left_out})" if left_out else "")
     for of in ("2d", "3d"):
@@ -152,7 +152,8 @@ def _judged_facts(report: ReplayReport) -> Iterator[tuple[str, str]]:
         yield "RMSE x, y, z", _triple(report.rmse_axes_m)
         yield "bias x, y, z", _triple(report.bias_m)
         yield "claimed σ", cm(report.sigma_2d_m if report.sigma_3d_m is None else report.sigma_3d_m)
-        yield "NEES", "–" if report.nees is None else f"{report.nees:.2f}; {_share(report.beyond_95)} beyond 95 %"
+        beyond = number(report.beyond_95, "{:.1f} %", 100.0)
+        yield "NEES", "–" if report.nees is None else f"{report.nees:.2f}; {beyond} beyond 95 %"
         yield "trajectory errors", f"absolute {cm(report.ate_m)}, relative {cm(report.rpe_m)} in a metre"
     if report.levels:
         exceeded = f"exceeded by {report.exceeded_horizontal} horizontally, {report.exceeded_vertical} vertically"
@@ -163,10 +164,6 @@ def _judged_facts(report: ReplayReport) -> Iterator[tuple[str, str]]:
         yield "alerts", alerts
     if report.truth_offset_s is not None and abs(report.truth_offset_s) > _WORTH_SHIFTING_S:
         yield "truth", f"fits best {report.truth_offset_s:+.3f} s later: see --truth-offset"
-
-
-def _share(value: float | None) -> str:
-    return "–" if value is None else f"{100.0 * value:.1f} %"
 
 
 def _triple(values_m: tuple[float, float, float] | None) -> str:

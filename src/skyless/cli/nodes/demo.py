@@ -216,7 +216,6 @@ def sentence(summary: dict[str, Any]) -> str:
 
 # Furnishings of the demo's own site: a plan, zones, names, an alarm rule, a georeference, a moved anchor.
 
-_SITE_NAME: Final = "Workshop"
 _PLAN: Final = Path(__file__).with_name("demo_plan.png")
 _CELL: Final = Zone("cell", "Robot cell", ((3.7, 0.4), (5.7, 0.4), (5.7, 2.7), (3.7, 2.7)), "#c2410c")
 _GOODS_IN: Final = Zone("goods-in", "Goods in", ((0.3, 5.3), (2.7, 5.3), (2.7, 7.7), (0.3, 7.7)), "#0f766e")
@@ -237,7 +236,7 @@ def furnished(lab: Site) -> Site:
     """The lab as a workshop, at an invented place on the Earth."""
     return replace(
         lab,
-        name=_SITE_NAME,
+        name="Workshop",
         outline_m=rectangle(6.0, 8.0),
         floor_plan=FloorPlanSite(str(_PLAN), width_m=6.0),
         georeference=GeoreferenceSite(52.5163, 13.3777, height_m=35.0, heading_deg=20.0),
@@ -269,9 +268,7 @@ _NAME: Final = "demo"
 _HOST: Final = "127.0.0.1"
 _PAGE_PORT: Final = 8080
 _TAGS_PER_PROCESS: Final = 25
-_BROKER_RESTART_S: Final = 0.2
 _KEEPALIVE_S: Final = 10
-_RECORDING_LIMIT_MB: Final = "1000"
 
 _SLOW_SHARE: Final = 0.1
 _SLOW_FOR: Final = 8
@@ -385,11 +382,7 @@ class WholeSite:
         return f"http://{_HOST}:{self.page_port}"
 
     async def run(self) -> None:
-        """Keep everything alive until cancelled.
-
-        Raises:
-            SkylessError: the embedded broker cannot be started.
-        """
+        """Keep everything alive until cancelled. Raises SkylessError if the embedded broker cannot be started."""
         with self._ether_held, self._page_held, self._ports:
             if self.address is not None:
                 await self._run_with(self.address, None)
@@ -452,7 +445,7 @@ class WholeSite:
                 code = await broker.wait()
                 self._log(f"broker ended (exit code {code}); started again")
                 await broker.stop(to_restart=True)
-                await asyncio.sleep(_BROKER_RESTART_S)
+                await asyncio.sleep(0.2)
                 broker = await start_broker(settings)
         finally:
             await asyncio.shield(broker.stop())
@@ -489,7 +482,7 @@ class WholeSite:
             Program("survey", ("survey", "--serve", *mqtt, *self._number, *known), start_after_s=_SURVEY_DELAY_S),
         ]
         if self.recording is not None:
-            limit = ("--limit-mb", _RECORDING_LIMIT_MB)
+            limit = ("--limit-mb", "1000")
             programs.append(Program("recorder", ("record", str(self.recording), *mqtt, *limit, *self._number), 1))
         if self.history is not None:
             history = ("history", "run", "--to", str(self.history), *self._number, *mqtt)
@@ -534,7 +527,6 @@ async def _place(address: MqttAddress, messages: Mapping[str, bytes], log: Log, 
 
 
 async def _publish(address: MqttAddress, messages: Mapping[str, bytes]) -> None:
-    """Publish retained messages."""
     connection = await open_connection(address, address.tls_context(), Introduction("", _KEEPALIVE_S))
     for topic, text in messages.items():
         connection.publish(topic, text, 1, retain=True)
@@ -597,7 +589,6 @@ def _named(kind: str, names: list[str]) -> str:
 _LONGEST_START_S: Final = 60.0
 """Longest wait until every tag has a fix."""
 
-_POLL_S: Final = 0.05
 _FRAME_S: Final = 0.25
 """Interval between two drawings of the site."""
 
@@ -673,7 +664,7 @@ class _Stage:
         while time.monotonic() - begun_s < _LONGEST_START_S:
             if sum(tag.health is not None for tag in self.whole.figures.tags.values()) >= self._asked.tags:
                 return
-            await asyncio.sleep(_POLL_S)
+            await asyncio.sleep(0.05)
         log("not all tags have a fix yet; skyless/… on the broker and the page show more")
 
     async def _watch(self) -> None:

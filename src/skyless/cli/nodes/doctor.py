@@ -197,7 +197,6 @@ def _report(checks: Sequence[Check]) -> str:
 # At a running site
 
 _LEASE_S: Final = 15.0
-_MAX_FIXES: Final = 20_000
 
 
 class SiteProbe:
@@ -208,7 +207,7 @@ class SiteProbe:
         self._picture = view.picture()
         self._found: dict[str, Check] = {}  # by kind of the condition's reason
         self._missed: dict[str, list[float]] = {}  # by anchor
-        self._fixes: deque[FixMessage] = deque(maxlen=_MAX_FIXES)
+        self._fixes: deque[FixMessage] = deque(maxlen=20_000)
         self._pairs = CounterPairs()
         self._stamps: Counter[tuple[int, int]] = Counter()  # by receiver and sender
         self._stamps_s: dict[int, tuple[float, float]] = {}  # by receiver: times of its first and last message
@@ -272,7 +271,6 @@ class SiteProbe:
         return Check("site", "ok", f"{finding}.")
 
     def _slots(self) -> Check:
-        """Check of missed transmissions."""
         shares = {anchor: statistics.mean(shares) for anchor, shares in self._missed.items()}
         worst, share = max(shares.items(), key=lambda one: one[1])
         finding = f"Anchor {worst} misses the most transmissions: {share:.1%}."

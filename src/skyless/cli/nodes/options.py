@@ -18,8 +18,6 @@ from skyless.run.broker import running_broker
 from skyless.run.gather.subjects import NatsAddress, nats_address
 from skyless.run.mqtt.address import MqttAddress, mqtt_address
 
-_DEFAULT_MQTT: Final = "mqtt://127.0.0.1:1883"
-
 _MAX_LIVE_HZ: Final = 4000.0
 """Beacons per second above which the emulated air is expected to fall behind; two cores kept up with 1000."""
 
@@ -50,7 +48,7 @@ class MqttOptions(Options, frozen=True, kw_only=True):
             if self.mqtt_ca is not None:
                 raise SkylessError("--mqtt is 'none'; give a broker's address together with --mqtt-ca")
             return None
-        return mqtt_address(self.mqtt or _DEFAULT_MQTT, self.mqtt_ca)
+        return mqtt_address(self.mqtt or "mqtt://127.0.0.1:1883", self.mqtt_ca)
 
     def required(self, right: str) -> MqttAddress:
         """The broker's address. Raises SkylessError for ``none``; ``right`` says what it should be."""

@@ -166,7 +166,6 @@ class SiteView:
         self.table.set_assets(self._named())
 
     def _named(self) -> dict[str, Asset]:
-        """The assets of the site shown, by tag."""
         return {} if self.site is None else assets_at(self._assets, self.site.site.name)
 
     def _on_alarm(self, message: AlarmMessage | None, channel: Channel) -> None:

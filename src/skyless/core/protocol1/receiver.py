@@ -26,13 +26,7 @@ from skyless.core.ticks import nearest
 class Receiver(BeaconReceiver):
     """One listening tag of protocol 1 with one of the paper's methods; ``joint`` hears it through ``Translator``."""
 
-    def __init__(
-        self,
-        method: str,
-        *,
-        site: int | None = None,
-        z_bounds_m: tuple[float, float] | None = None,
-    ) -> None:
+    def __init__(self, method: str, *, site: int | None = None, z_bounds_m: tuple[float, float] | None = None) -> None:
         """Create a tag that has heard nothing. ``method``: one of ``SNAPSHOTS``; the rest as for ``skyless.Receiver``.
 
         Raises:

@@ -95,17 +95,7 @@ def protocol_interval(rate_tag: float, tx_anchor_master: float, tx_master: float
 
 
 def literal_tdoa(
-    m1: int,
-    m2: int,
-    s1: int,
-    s2: int,
-    a1: int,
-    a2: int,
-    r1: int,
-    r2: int,
-    rm1: int,
-    rm2: int,
-    tof_ticks: float,
+    m1: int, m2: int, s1: int, s2: int, a1: int, a2: int, r1: int, r2: int, rm1: int, rm2: int, tof_ticks: float
 ) -> tuple[float, float]:
     """TDoAs of the first and of the delayed messages in ticks of the tag (``eq:GPSTDoA``), to the letter.
 
@@ -265,11 +255,7 @@ class Snapshots:
         return tdoas[self._method is SnapshotMethod.LITERAL_DELAYED]
 
     def _fix(
-        self,
-        solution: Solution,
-        reference: tuple[Observation, Observation],
-        anchors: tuple[int, ...],
-        anchors_m: Array,
+        self, solution: Solution, reference: tuple[Observation, Observation], anchors: tuple[int, ...], anchors_m: Array
     ) -> Fix:
         first_message = self._method in {SnapshotMethod.LITERAL, SnapshotMethod.WEIGHTED}
         message = reference[0 if first_message else 1]

@@ -16,14 +16,7 @@ from skyless.core.air.neighbours import (
     neighbour_of,
     unwrap_stamp,
 )
-from skyless.core.air.site_choice import (
-    CHANGED,
-    FOREIGN,
-    NO_SITE,
-    SiteChoice,
-    choose_site,
-    restart_choice,
-)
+from skyless.core.air.site_choice import CHANGED, FOREIGN, NO_SITE, SiteChoice, choose_site, restart_choice
 from skyless.core.air.site_pages import SitePages
 from skyless.core.estimator.process import Packet, Relays
 from skyless.core.estimator.settings import EstimatorSettings

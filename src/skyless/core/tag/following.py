@@ -272,14 +272,7 @@ def _begin_search(c: Course, q: Acquisition) -> None:
 
 
 def follow(
-    c: Course,
-    s: State,
-    q: Acquisition,
-    time: FixTime,
-    packet: Packet,
-    relays: Relays,
-    packed: Bytes,
-    packed_bytes: int,
+    c: Course, s: State, q: Acquisition, time: FixTime, packet: Packet, relays: Relays, packed: Bytes, packed_bytes: int
 ) -> int:
     """Process a packet whose further relays are still encoded (``packed``). Returns the outcome."""
     rx_ticks = packet.rx_ticks

@@ -302,7 +302,6 @@ def _plain(schema: object) -> object:
 
 
 _ALL: Final = 2**53
-_STORED_S: Final = 5.0
 _POLL_S: Final = 0.02
 
 
@@ -449,7 +448,7 @@ async def acknowledge(live: LiveSite, *, rule: RuleId, subject: Subject, body: A
     """Acknowledge an alarm: answered when the broker has it."""
     live.acknowledge(rule, subject, body.id, body.by)
     try:
-        async with asyncio.timeout(_STORED_S):
+        async with asyncio.timeout(5.0):
             while not live.alarms.is_acknowledged(rule, subject, body.id):
                 await asyncio.sleep(_POLL_S)
     except TimeoutError:

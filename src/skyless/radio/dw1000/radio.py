@@ -354,11 +354,7 @@ class ChipSession:
         """Whether the chip had no event when last served."""
 
     def start(self) -> None:
-        """Reset and configure the chip, and listen.
-
-        Raises:
-            ChipError: no DW1000 answers.
-        """
+        """Reset and configure the chip, and listen. Raises ChipError if no DW1000 answers."""
         self._pending = None
         self.driver.start(self._delays.tx_ticks, self._delays.rx_ticks)
         self.driver.receive()

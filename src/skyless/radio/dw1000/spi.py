@@ -33,7 +33,6 @@ _VAIN: Final = (
     "rises though the chip has no event: is irq= the right pin, the wire sound? "
     "The chip is polled every 0.5 ms meanwhile"
 )
-_RESET_S: Final = 0.001
 _MAX_EDGE_READS: Final = 8
 """Each read empties the kernel's queue; a line that rises faster than it is read is not waited for."""
 
@@ -118,7 +117,7 @@ class SpiBus:
         """Pull RSTn low for a millisecond, then let it float: the chip pulls it up itself (data sheet 5.6)."""
         if self._reset is not None:
             self._reset.reconfigure_lines({self._reset_pin: self._low})
-            time.sleep(_RESET_S)
+            time.sleep(0.001)
             self._reset.reconfigure_lines({self._reset_pin: self._floating})
 
     def pause_us(self, microseconds: int) -> None:
@@ -209,7 +208,6 @@ class SpiPort:
 
 
 async def _is_set(event: asyncio.Event, seconds: float) -> bool:
-    """Whether the event is set within this time."""
     with contextlib.suppress(TimeoutError):
         async with asyncio.timeout(seconds):
             await event.wait()

@@ -32,12 +32,9 @@ _MESSAGES: Final = frozenset(map(int, DtMessageType))
 class DtTag:
     """Converts a tag's notifications to packets, and counts unusable ones."""
 
-    def __init__(
-        self, drops: Drops, anchors_m: Mapping[int, Point] | None = None, frame: AnchorFrame | None = None
-    ) -> None:
-        """``anchors_m``: positions that replace those stated by anchors; ``frame``: that of these, if tags share it."""
+    def __init__(self, drops: Drops, frame: AnchorFrame) -> None:
         self._drops = drops
-        self._rounds = DtRounds(anchors_m, frame)
+        self._rounds = DtRounds(frame)
 
     def on_uci(self, packet: UciPacket, host_s: float | None = None) -> list[Packet]:
         """Packets of a notification in order of reception; ``host_s``: its arrival."""
@@ -111,7 +108,7 @@ def _has_measurements(packets: list[UciPacket]) -> bool:
 
 def read_binary(stream: BufferedIOBase, drops: Drops, anchors_m: Mapping[int, Point] | None = None) -> Iterator[Packet]:
     """Yield the packets of a binary log; ``anchors_m``: positions that replace those stated by anchors."""
-    reader, tag = UciReader(drops), DtTag(drops, anchors_m)
+    reader, tag = UciReader(drops), DtTag(drops, AnchorFrame(anchors_m))
     for chunk in chunks(stream, drops):
         for packet in reader.feed(chunk):
             yield from tag.on_uci(packet)
@@ -134,7 +131,7 @@ def recognise_pcapng(head: bytes) -> bool:
 
 def read_pcapng(stream: BufferedIOBase, drops: Drops, anchors_m: Mapping[int, Point] | None = None) -> Iterator[Packet]:
     """Yield the packets of a capture of UCI."""
-    reader, tag = UciReader(drops), DtTag(drops, anchors_m)
+    reader, tag = UciReader(drops), DtTag(drops, AnchorFrame(anchors_m))
     for kind, body, order in _blocks(chunks(stream, drops), drops):
         if kind == _PACKET and len(body) >= 20:
             length = int.from_bytes(body[12:16], order)
@@ -165,7 +162,7 @@ def _blocks(pieces: Iterator[bytes], drops: Drops) -> Iterator[tuple[int, bytes,
 
 def read_text(stream: BufferedIOBase, drops: Drops, anchors_m: Mapping[int, Point] | None = None) -> Iterator[Packet]:
     """Yield the packets of a text log; lines without a packet are counted."""
-    reader, tag = UciReader(drops), DtTag(drops, anchors_m)
+    reader, tag = UciReader(drops), DtTag(drops, AnchorFrame(anchors_m))
     for line in lines(stream, drops):
         found = _packets_of_line(line)
         if not found and line.strip():

@@ -3,14 +3,14 @@
 import time
 from abc import ABC, abstractmethod
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from typing import Final, Generic, TypeVar
 
 import msgspec
 from msgspec import structs
 
 from skyless.core.air.frame import MAX_FRAME_BYTES, Diagnostics, Reception, Transmission
-from skyless.core.air.masterless_packets import Packet, Point
+from skyless.core.air.masterless_packets import Packet
 from skyless.core.ticks import wrap
 from skyless.files import Drops, LineCutter
 from skyless.radio.foreign.bitcraze import BinaryCutter, packet_of_line, recognise_binary, recognise_text
@@ -150,14 +150,13 @@ class UciRadio(_ListeningBoard[Packet]):
 
     firmware = "FiRa's UCI with a DL-TDoA session that goes on"
 
-    def __init__(self, path: str, baud: int, name: str, anchors_m: Mapping[int, Point], frame: AnchorFrame) -> None:
-        """``anchors_m``: positions that replace those stated by anchors; ``frame``: that of these, shared by tags."""
+    def __init__(self, path: str, baud: int, name: str, frame: AnchorFrame) -> None:
         super().__init__(path, baud, name)
-        self._anchors_m, self.frame = anchors_m, frame
-        self._reader, self._tag = UciReader(self.counters), DtTag(self.counters, anchors_m, frame)
+        self.frame = frame
+        self._reader, self._tag = UciReader(self.counters), DtTag(self.counters, frame)
 
     def _start(self, send: Callable[[bytes], None]) -> None:  # noqa: ARG002 - it is sent nothing
-        self._reader, self._tag = UciReader(self.counters), DtTag(self.counters, self._anchors_m, self.frame)
+        self._reader, self._tag = UciReader(self.counters), DtTag(self.counters, self.frame)
 
     def _events(self, data: bytes, host_s: float) -> Iterator[Packet]:
         for packet in self._reader.feed(data):

@@ -9,10 +9,10 @@ import os
 import re
 from asyncio import StreamReader, StreamWriter
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Final
 
-from skyless.core.air.masterless_packets import Packet, Point
+from skyless.core.air.masterless_packets import Packet
 from skyless.core.errors import SkylessError
 from skyless.files import CHUNK_BYTES, MAX_LINE_BYTES, LineCutter
 from skyless.radio.foreign.phones import Phone
@@ -34,15 +34,14 @@ _REQUEST: Final = re.compile(rb"[A-Z]+ \S+ HTTP/\d")
 class PhoneRadio:
     """One phone's DL-TDoA measurements: the packets that the same records in a file give, in the phone's own time."""
 
-    def __init__(self, host: str, port: int, name: str, anchors_m: Mapping[int, Point], frame: AnchorFrame) -> None:
-        """``anchors_m``: positions that replace those stated by anchors; ``frame``: that of these."""
+    def __init__(self, host: str, port: int, name: str, frame: AnchorFrame) -> None:
         self.name = name
         self.port = port
         """The port in use; with 0 given, known once the server runs."""
         self.counters: Counter[str] = Counter()
         self.frame = frame
         self._host = host
-        self._records = Phone(self.counters, anchors_m, frame)
+        self._records = Phone(self.counters, frame)
         self._listener: Callable[[Packet | Restarted | Gone | Hint], None] = ignore
         self._connections: dict[StreamWriter, None] = {}
         self._phone: StreamWriter | None = None

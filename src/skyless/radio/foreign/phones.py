@@ -117,7 +117,7 @@ def _records(line: bytes) -> list[_Record] | None:
 
 def read(stream: BufferedIOBase, drops: Drops, anchors_m: Mapping[int, Point] | None = None) -> Iterator[Packet]:
     """Yield the packets of a file of records; ``anchors_m``: positions that replace all that anchors state."""
-    phone = Phone(drops, anchors_m)
+    phone = Phone(drops, AnchorFrame(anchors_m))
     for line in lines(stream, drops):
         yield from phone.on_message(line)
     yield from phone.finish()
@@ -126,12 +126,9 @@ def read(stream: BufferedIOBase, drops: Drops, anchors_m: Mapping[int, Point] | 
 class Phone:
     """Converts one phone's records to packets, and counts unusable ones."""
 
-    def __init__(
-        self, drops: Drops, anchors_m: Mapping[int, Point] | None = None, frame: AnchorFrame | None = None
-    ) -> None:
-        """``anchors_m``: positions that replace those stated by anchors; ``frame``: that of these."""
+    def __init__(self, drops: Drops, frame: AnchorFrame) -> None:
         self._drops = drops
-        self._rounds = DtRounds(anchors_m, frame)
+        self._rounds = DtRounds(frame)
         self._polls: dict[int, int] = {}
         """How many each cluster has sent, by its initiator."""
         self._newest_initiator: int | None = None

@@ -591,7 +591,9 @@ class _Round:
 class AnchorFrame:
     """The coordinate frame of one recording, or of one process's boards."""
 
-    def __init__(self) -> None:
+    def __init__(self, known_m: Mapping[int, Point] | None = None) -> None:
+        self.known_m = known_m or {}
+        """Positions that replace those stated by anchors."""
         self.origin: GeodeticPoint | None = None
         """The first geodetic position, if positions are geodetic."""
         self._is_relative = False
@@ -613,10 +615,8 @@ class AnchorFrame:
 class DtRounds:
     """Converts the messages of one tag, in order, to packets with relays."""
 
-    def __init__(self, anchors_m: Mapping[int, Point] | None = None, frame: AnchorFrame | None = None) -> None:
-        """``anchors_m``: positions that replace those stated by anchors; ``frame``: that of these."""
-        self._known_m = anchors_m or {}
-        self._frame = frame or AnchorFrame()
+    def __init__(self, frame: AnchorFrame) -> None:
+        self._frame = frame
         self._stated_m: dict[int, Point] = {}
         self._rounds: dict[int, _Round] = {}
 
@@ -628,7 +628,7 @@ class DtRounds:
 
     def on_message(self, message: DtMessage) -> Packet | str:
         """The packet of a message, or the reason why it is unusable."""
-        position_m = None if self._known_m else self._frame.position_m(message.location)
+        position_m = None if self._frame.known_m else self._frame.position_m(message.location)
         if position_m is not None:
             self._stated_m.pop(message.address, None)
             if len(self._stated_m) >= MAX_ANCHORS_KEPT:
@@ -674,7 +674,7 @@ class DtRounds:
         return _packet(message, position_m, (Relay(poll.address, _sequence(poll), wrap(rx_ticks), flight),))
 
     def _position_m(self, address: int) -> Point | None:
-        return self._known_m.get(address, self._stated_m.get(address))
+        return self._frame.known_m.get(address, self._stated_m.get(address))
 
 
 def _packet(message: DtMessage, position_m: Point | None, relays: tuple[Relay, ...]) -> Packet:

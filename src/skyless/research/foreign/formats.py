@@ -248,10 +248,8 @@ def format_of(path: str | PathLike[str], name: str | None = None) -> Format:
     Raises:
         ConfigurationError: the file cannot be opened, or its format is unknown.
     """
-    return _recognised(path) if name is None else _named(path, name)
-
-
-def _named(path: str | PathLike[str], name: str) -> Format:
+    if name is None:
+        return _recognised(path)
     for known in FORMATS:
         if known.name == name:
             return known

@@ -51,7 +51,7 @@ from skyless.research.paper.plan import (
     listen,
     receptions,
 )
-from skyless.research.studies.runner import Cell
+from skyless.research.studies.runner import Cell, seed_of
 from skyless.research.uncertainty import CORRECTED, PRINTED, Chain
 from skyless.sim.evaluation.scenarios import Request, fleet_of
 from skyless.sim.impairments import DelayError, Impairments, Outage, lab_impairments
@@ -290,14 +290,9 @@ def paper_checks(seed: int, draws: int, *, origin_s: float | None = None) -> tup
     for noise in NOISES:
         for anchor in range(1, CHECKED_ANCHORS + 1):
             chain = paper_chain(seed, anchor, noise, origin_s=origin_s)
-            moments = draw_moments(chain, _draw_seed(seed, anchor), draws, uniform=noise == "uniform")
+            moments = draw_moments(chain, seed_of(seed, anchor) >> 1, draws, uniform=noise == "uniform")
             checks.extend(_checks(chain, moments, noise, anchor))
     return tuple(checks)
-
-
-def _draw_seed(seed: int, anchor: int) -> int:
-    """Seed of one anchor's draws."""
-    return int(np.random.SeedSequence([seed, anchor]).generate_state(1, np.uint64)[0] >> 1)
 
 
 def _checks(chain: Chain, moments: ChainMoments, noise: str, anchor: int) -> Iterator[PaperCheck]:
@@ -434,7 +429,7 @@ def lambda_distribution(seed: int, noise: str, draws: int) -> LambdaDistribution
     edges = np.linspace(-_REACH_SIGMAS, _REACH_SIGMAS, _BINS + 1) * theory_m
     counts = np.zeros(_BINS, np.int64)
     squares = 0.0
-    for lambdas in draw_lambdas(chain, _draw_seed(seed, 1), draws, uniform=noise == "uniform"):
+    for lambdas in draw_lambdas(chain, seed_of(seed, 1) >> 1, draws, uniform=noise == "uniform"):
         values = lambdas[:, 0]
         counts += np.histogram(values, edges)[0]
         squares += float(values @ values)
@@ -666,7 +661,6 @@ _PIECES: Final = 40
 
 
 def _walk_cells(plan: Plan) -> list[Cell]:
-    """A tag that walks round its rectangle."""
     path = Waypoints(_CORNERS_M, _SPEED_MPS, loop=True, corner_s=_CORNER_S)
     tag, until_s = (path, dict.fromkeys(_METHODS, sys.maxsize)), (plan.laps + 0.5) * _LAP_S
     world = partial(listen, paper_lab_site(RADIO_PS), [tag], lab_impairments(RADIO_PS), plan.seed, until_s)
@@ -901,7 +895,6 @@ def rate_sites() -> dict[str, Site]:
 
 
 def _rate_cells(plan: Plan) -> list[Cell]:
-    """One tag at each site."""
     tags, until_s = [TagSpec(Static(3.0, 4.0))], _COUNTED_FROM_S + plan.rate_s
     return [
         Cell(f"rate/{name}", partial(receptions, site, tags, _METHODS, plan.seed, until_s), plan.rate_s * 0.05)
@@ -938,7 +931,6 @@ def _rate(plan: Plan, results: Results) -> Found:
 
 _CLAIM_FIXES: Final = 30_000
 """Fixes per position in the paper."""
-_HALVINGS: Final = 50
 _FIT_FROM_PS: Final = 50.0
 """Below, rounding to ticks and the crystals' own noise flatten the curve."""
 
@@ -999,7 +991,7 @@ def largest_of_m(covariance_m2: Array, count: float, quantile: float) -> float:
     weight = variances_m2 / np.sqrt(np.linalg.det(covariance_m2))
     exceed, most_m = -np.expm1(np.log(quantile) / count), 12.0 * float(np.sqrt(np.trace(covariance_m2)))
     least_m = 0.0
-    for _ in range(_HALVINGS):
+    for _ in range(50):
         middle_m = (least_m + most_m) / 2.0
         if np.mean(np.exp(-0.5 * middle_m**2 / variances_m2) * weight) > exceed:
             least_m = middle_m

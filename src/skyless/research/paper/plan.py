@@ -131,7 +131,6 @@ class Section(Struct, frozen=True):
     reason: str
     panels: tuple[Panel, ...]
     table: tuple[tuple[str, ...], ...]
-    """Rows of cells, the first one the heads."""
     numbers: dict[str, object]
     """The same and more for programs, SI units in the names."""
     command: str
@@ -151,7 +150,6 @@ class Found(NamedTuple):
     table: Table
     panels: list[Panel]
     numbers: dict[str, object]
-    """For programs, SI units in the names."""
 
 
 def gaussian(values: Array, std: float, mean: float = 0.0) -> Array:

@@ -2,6 +2,7 @@
 
 import tempfile
 from collections.abc import Callable
+from operator import methodcaller
 from pathlib import Path
 from typing import Any
 
@@ -71,7 +72,7 @@ def _written(plan: Plan, sections: list[Section], results: dict[str, Any], out: 
         checks=tuple(msgspec.to_builtins(check) for check in results["checks"]),
         sections=tuple(_as_fields(section) for section in sections),
     )
-    numbers = msgspec.json.format(msgspec.json.encode(report, enc_hook=_json_value), indent=1)
+    numbers = msgspec.json.format(msgspec.json.encode(report, enc_hook=methodcaller("tolist")), indent=1)
     page = report_page(command, sections, pictures, quick=plan.quick)
     replace_files({**files, out / "numbers.json": numbers, out / "report.html": page.encode()})
     return report
@@ -81,10 +82,3 @@ def _as_fields(section: Section) -> dict[str, object]:
     """A section without its texts and figures."""
     names = ("key", "title", "label", "verdict", "reason", "numbers", "command")
     return {name: getattr(section, name) for name in names} | {"pictures": [panel.name for panel in section.panels]}
-
-
-def _json_value(value: object) -> object:
-    """NumPy's scalars and arrays as plain numbers and lists."""
-    if hasattr(value, "tolist"):
-        return value.tolist()
-    raise TypeError(f"{type(value).__name__} has no form in JSON")

@@ -300,7 +300,6 @@ class Pipeline:
         return Counter() if self._engine is None else Counter(self._engine.drops)
 
     def _pairs(self, record: Record) -> Sequence[PairTdoa]:
-        """The differences of one record."""
         if isinstance(record, Packet):
             assert self._engine is not None
             found: Sequence[PairTdoa] = self._engine.on_packet(record)

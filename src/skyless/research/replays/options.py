@@ -135,9 +135,7 @@ class ReplayOptions(RecordingOptions, frozen=True, kw_only=True):
     skyless record: replay as if its anchors had had the antenna delays of this site, as skyless survey writes them."""
     channel: int | None = None
     """Which radio channel, in recordings of several; by default the first for packets, and all for differences."""
-    tag_height_m: Annotated[
-        float | str, Option("tag-height"), Text(partial(read_height, words=HEIGHT_WORDS)), Rule(_check_height)
-    ] = "auto"
+    tag_height_m: Annotated[float | str, Option("tag-height"), Text(_read_height), Rule(_check_height)] = "auto"
     """The tags' height: metres, truth (its median), free (estimated), or auto: free where the anchors determine it."""
     tag_height_std_m: Annotated[NotNegative | None, Option("tag-height-std")] = None
     """Standard deviation of the tag's height from the one that is given, in metres, which fixes and levels then

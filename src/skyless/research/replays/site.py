@@ -308,7 +308,6 @@ class SiteReplay:
     def _add(
         self, replay: TagReplay, fixes: Iterable[Replayed], on_fix: Callable[[str, Replayed], None] | None
     ) -> None:
-        """Judge a tag's fixes."""
         tag = replay.tag
         for made in fixes:
             first_s, _ = self._spans.get(tag, (made.unix_s, 0.0))

@@ -161,18 +161,15 @@ _EPISODE_COST_S: Final = 0.02
 
 _MAX_RATIO: Final = 1.02
 
-_NOISES_PS: Final = (100.0, 150.0)
-_WALKS: Final = (1e-9, 1e-8)
-_QAS_M2PS3: Final = (0.5, 2.0)
 _MESHES: Final = ((False, False), (True, False), (True, True))
 """Without; relayed with an anchor's next frame; known at once."""
 
 EFFICIENCY_CASES: Final = tuple(
     Case(noise_ps, walk, qa, mesh, at_once)
     for mesh, at_once in _MESHES
-    for noise_ps in _NOISES_PS
-    for walk in _WALKS
-    for qa in _QAS_M2PS3
+    for noise_ps in (100.0, 150.0)
+    for walk in (1e-9, 1e-8)
+    for qa in (0.5, 2.0)
 )
 
 
@@ -224,11 +221,7 @@ def _bound(case: Case, anchors: Array, episode: Episode, slot_s: float) -> float
 
 
 def cells(plan: Plan) -> list[Cell]:
-    """Episodes in chunks.
-
-    Raises:
-        SkylessError: the method is not one that can be fed with an episode's stamps.
-    """
+    """Episodes in chunks. Raises SkylessError if the method is not one that can be fed with an episode's stamps."""
     if plan.method != "joint":
         raise SkylessError(f"--method is {plan.method!r}; the study efficiency is about joint, whose bound it computes")
     return [

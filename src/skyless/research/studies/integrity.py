@@ -176,11 +176,7 @@ def anchors_of(scene: str) -> Array:
 
 
 def cells(plan: Plan) -> list[Cell]:
-    """Episodes in chunks.
-
-    Raises:
-        SkylessError: the method gives no protection levels.
-    """
+    """Episodes in chunks. Raises SkylessError if the method gives no protection levels."""
     if plan.method != "joint":
         raise SkylessError(f"--method is {plan.method!r}; protection levels are given by joint")
     case = Case(plan.noise_ps, qa=ROOM_QA_M2PS3, mesh=True)

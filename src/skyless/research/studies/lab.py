@@ -25,7 +25,6 @@ from skyless.sim.trajectory import Static, Trajectory, Waypoints
 
 
 def _within(most: float | None) -> tuple[Limit, ...]:
-    """A limit on the ratio, or none."""
     return () if most is None else (Limit("ratio", most=most),)
 
 
@@ -177,7 +176,6 @@ def _slow(plan: Plan, superframe_s: float) -> Site:
 #
 # Paths for tags that move hard: turns, zigzags, stops, all at a given acceleration.
 
-_ACCELERATION_MPS2: Final = 3.0
 _STILL: Final = "still"
 
 _LEG_S: Final = (2.4, 2.8)
@@ -200,7 +198,7 @@ def motion_cases(plan: Plan) -> list[Case]:
         return [kind(draw, low_m, high_m) for _ in range(plan.tags)]
 
     def moving(kind: Callable[..., Trajectory], speed_mps: float) -> Callable[..., Trajectory]:
-        return partial(kind, speed_mps=speed_mps, acceleration_mps2=_ACCELERATION_MPS2)
+        return partial(kind, speed_mps=speed_mps, acceleration_mps2=3.0)
 
     kinds = {
         _STILL: still,
@@ -272,7 +270,6 @@ def _path(
 
 # Condition ``scale``: growing numbers of tags in the lab, and of anchors on a ring; all tags lie still.
 
-_FLEET_WARMUP_S: Final = 1.0
 _FLEET_S: Final = 0.5
 """Fleets of all sizes are judged in the same stretch of time, short enough for ten thousand tags."""
 _FLEETS: Final = ((1, 48), (10, 24), (100, 12), (1_000, 4), (10_000, 2))
@@ -284,7 +281,7 @@ _RING_ROOM_M: Final = (12.0, 16.0)
 def scale_cases(plan: Plan) -> list[Case]:
     """Growing fleets, then growing rings of anchors; a quick study has half of the worlds and no fleet of 10,000."""
     lab = paper_lab_site(plan.noise_ps)
-    in_lab = partial(worlds, plan, lab, warmup_s=_FLEET_WARMUP_S, seconds=_FLEET_S)
+    in_lab = partial(worlds, plan, lab, warmup_s=1.0, seconds=_FLEET_S)
     fleets = [(tags, count // 2) for tags, count in _FLEETS[:-1]] if plan.quick else _FLEETS
     rings = [(count, ring(plan, count)) for count in (_ANCHORS[::2] if plan.quick else _ANCHORS)]
     return [

@@ -32,7 +32,6 @@ _WIDE_X_RATIO: Final = 10.0
 
 # Which side of a limit is the safe one
 
-_FAINT: Final = 0.07
 _ROOM: Final = 1.25
 """Both sides of the limit are in view: the axis reaches to at least this multiple of it, and to a part of it."""
 
@@ -66,7 +65,7 @@ def shade_sides(axes: Axes, sides: Sides, limit: float, *, along: Literal["x", "
     for start, end, side, words in ((low, limit, "below", sides.below), (limit, high, "above", sides.above)):
         colour = INK if sides.safe == "neither" else GREEN if side == sides.safe else RED
         if sides.safe != "neither":
-            span(start, end, color=colour, alpha=_FAINT, linewidth=0.0, zorder=0.5)
+            span(start, end, color=colour, alpha=0.07, linewidth=0.0, zorder=0.5)
         _name(axes, words, colour, side, along)
     set_limits(low, high)
 

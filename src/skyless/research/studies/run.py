@@ -10,15 +10,7 @@ from msgspec import Struct
 from skyless.core.errors import SkylessError
 from skyless.research.studies import efficiency, integrity, large, room, survey, surveyed_rooms, watch
 from skyless.research.studies.picture import Look, draw
-from skyless.research.studies.runner import (
-    KeptResults,
-    Plan,
-    Row,
-    Study,
-    UnfinishedError,
-    run_cells,
-    run_cells_here,
-)
+from skyless.research.studies.runner import KeptResults, Plan, Row, Study, UnfinishedError, run_cells, run_cells_here
 
 OF_EPISODES: Final = ("efficiency", "integrity")
 """Studies of episodes, which have no worlds."""

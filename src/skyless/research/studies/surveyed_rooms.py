@@ -522,9 +522,7 @@ HAND: Final = "by hand"
 
 _WARMUP_S: Final = 1.5
 _SURVEY_S: Final = 20.0
-_AT_REST_M: Final = (3.0, 4.0, 0.0)
 _DELAY_STD_M: Final = 0.07
-_PAIR_STDS_M: Final = (0.0, 0.02, 0.05)
 _RUN_S: Final = 0.018
 """Approximate CPU time of a tag for a second of a world."""
 
@@ -565,7 +563,7 @@ def groups() -> tuple[Group, ...]:
             files,
         )
         for layout, files in of_layout.items()
-        for pair_std_m in _PAIR_STDS_M
+        for pair_std_m in (0.0, 0.02, 0.05)
     ]
     return (*walking, Group("lab, at rest", "lab", at_rest=True))
 
@@ -595,7 +593,7 @@ def room_results(run: RoomRun) -> tuple[RunResult, ...]:
     plan, seed = run.plan, seed_of(run.plan.seed, run.world)
     room = drawn_room(survey_layouts()[run.group.layout], run.group.errors, plan.noise_ps, seed)
     if run.group.at_rest:
-        paths: tuple[Trajectory, ...] = (Static(*_AT_REST_M),) * plan.tags
+        paths: tuple[Trajectory, ...] = (Static(3.0, 4.0, 0.0),) * plan.tags
     else:
         paths = tuple(wanderers(site_at(room.layout, room.layout.position_m, plan.noise_ps), plan.tags, room.seed))
     return tuple(

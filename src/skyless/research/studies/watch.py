@@ -99,7 +99,6 @@ _EVENTS: Final = 50
 """Events in a world."""
 _QUIET_WINDOWS: Final = 1080
 """Windows of 10 s without an event in a world: three hours."""
-_QUIET_DRIFTS_S: Final = (10.0, 60.0, 600.0)
 _REAL_DRIFT_M: Final = (0.008, 0.025)
 _LIVELY_M: Final = 0.09
 _NOISE_WINDOWS: Final = 1_000_000
@@ -151,7 +150,7 @@ def _cases() -> list[WatchCase]:
             WatchCase(f"{layout}, a person on some links", series, layout, "door", 0.0),
         ]
     for layout in _LAYOUTS:
-        for drift_s in _QUIET_DRIFTS_S:
+        for drift_s in (10.0, 60.0, 600.0):
             name = f"{layout}, nothing, drift of {drift_s:g} s"
             series = "nothing happens, drift 0.8 to 2.5 cm, one pair 9 cm"
             found.append(WatchCase(name, series, layout, "none", 0.0, _REAL_DRIFT_M, drift_s, _LIVELY_M))

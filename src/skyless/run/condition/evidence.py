@@ -23,7 +23,6 @@ _WINDOW_S: Final = 60.0
 _RECENT_S: Final = 10.0
 """Period of the ages in the percentiles, long enough for tags with one fix per second."""
 
-_MAX_AGES: Final = 4096  # of the newest fixes
 _MAX_CHANGES: Final = 100
 
 USE_WINDOW_S: Final = 2.0
@@ -119,7 +118,7 @@ class FixAges:
     def __init__(self) -> None:
         self._tags: dict[str, _Tag] = {}
         self._least: dict[str, tuple[float, float]] = {}  # next result of ``least_ages_s``
-        self._recent: deque[tuple[float, float]] = deque(maxlen=_MAX_AGES)  # arrival times of fixes, and their ages
+        self._recent: deque[tuple[float, float]] = deque(maxlen=4096)  # arrival times of the newest fixes, and ages
 
     def add_fix(self, name: str, unix_s: float, latency_s: float, now_s: float) -> float:
         """Add a fix that arrives now and whose last frame ended at ``unix_s`` by the tag's clock. Returns its age."""

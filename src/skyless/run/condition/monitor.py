@@ -125,7 +125,6 @@ def _of(what: str, kind: str, level: _Severity, text: str, advice: str, names: I
 
 
 def _reported(evidence: Evidence, kind: str, health: type[_Health], now_s: float) -> dict[str, _Health]:
-    """Healths of the nodes of a kind that report."""
     nodes = evidence.table.senders(kind)
     return {name: one.health for name, one in nodes if one.reports(now_s) and isinstance(one.health, health)}
 
@@ -230,7 +229,6 @@ _Sign = tuple[str, float, str]  # computer, lost share, and words
 
 
 def _airs(evidence: Evidence) -> list[Node]:
-    """Running emulated airs."""
     return [air for _, air in evidence.table.senders("ether") if air.online is not False]
 
 
@@ -522,7 +520,6 @@ def _receives(tag: Node, now_s: float) -> bool:
 
 
 def _chains(keyed: Mapping[str, AnchorHealth]) -> Iterable[Reason]:
-    """Key chains have ended or end soon."""
     advice = "Make a successor with skyless site keys rotate, and give the anchors its files."
     ended = [name for name, health in keyed.items() if _left_s(health) <= 0.0]
     if ended:
@@ -543,7 +540,6 @@ def _all_or_some(names: list[str], keyed: Mapping[str, AnchorHealth]) -> str:
 
 
 def _codes(evidence: Evidence, keyed: Mapping[str, AnchorHealth], now_s: float) -> Iterable[Reason]:
-    """Anchors with keys send without codes."""
     without = {
         name: health.code_fault
         for name, health in keyed.items()
@@ -564,7 +560,6 @@ def _codes(evidence: Evidence, keyed: Mapping[str, AnchorHealth], now_s: float) 
 def _keys(
     evidence: Evidence, keyed: Mapping[str, AnchorHealth], anchors: Mapping[str, AnchorHealth], now_s: float
 ) -> Iterable[Reason]:
-    """Anchors have no keys although others have them."""
     without = [
         name
         for name in anchors

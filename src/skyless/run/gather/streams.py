@@ -38,8 +38,6 @@ NEWEST_OF_EACH: Final[dict[str, Any]] = {"max_msgs_per_subject": 1, "allow_direc
 """Limits of a stream that keeps the newest message of each subject for direct requests."""
 
 _NO_ROOM: Final = 10047  # JetStream error code
-_DUPLICATES_S: Final = 120.0
-_READ_S: Final = 10.0
 _IDLE_S: Final = 2.0
 _ABANDONED_S: Final = 60.0
 _RETRY_S: Final = 1.0
@@ -51,7 +49,7 @@ async def make_streams(stream: "JetStreamContext", site: int, keep_bytes: int) -
     Raises:
         SkylessError: the server has no room for these bytes.
     """
-    all_fixes = {"max_age": KEEP_S, "max_bytes": keep_bytes, "duplicate_window": _DUPLICATES_S}
+    all_fixes = {"max_age": KEEP_S, "max_bytes": keep_bytes, "duplicate_window": 120.0}
     for name, taken, limits in (
         (FIX_STREAM, (FIXES,), all_fixes),
         (NAMES_STREAM, (NAMES,), NEWEST_OF_EACH),
@@ -99,7 +97,7 @@ async def messages(
         found = await reading.consumer_info()
         is_empty = not found.num_pending and not (found.delivered and found.delivered.consumer_seq)
         while not is_empty:
-            message = await reading.next_msg(_READ_S)
+            message = await reading.next_msg(10.0)
             yield message
             is_empty = message.metadata.num_pending == 0
     finally:

@@ -102,8 +102,6 @@ def site_in(subject: str) -> int | None:
 FIRST_PORT: Final = 4222
 MAX_PAYLOAD: Final = 8 * 1024 * 1024
 """Largest message in bytes, such as a floor plan, that a site's server and a hub take."""
-_FIND_AGAIN_S: Final = 0.5
-_CONNECT_S: Final = 2
 _PING_S: Final = 5
 """After two unanswered pings another server is tried."""
 _SAME_TROUBLE_S: Final = 30.0
@@ -199,8 +197,8 @@ async def connect(address: NatsAddress, name: str, say: Log, drops: Counter[str]
         error_cb=on_error,
         inbox_prefix=inbox,
         max_reconnect_attempts=-1,
-        reconnect_time_wait=_FIND_AGAIN_S,
-        connect_timeout=_CONNECT_S,
+        reconnect_time_wait=0.5,
+        connect_timeout=2,
         ping_interval=_PING_S,
     )
     return client

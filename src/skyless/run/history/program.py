@@ -51,7 +51,6 @@ if TYPE_CHECKING:
 # The history of a site, from its streams.
 
 _PERIOD_S: Final = 0.2
-_STREAM_RETRY_S: Final = 2.0
 _NAMES_S: Final = 60.0
 """How much later than a batch its tags' names may come: a hub's streams catch up one after the other."""
 _MAX_SENDERS: Final = 1000
@@ -246,7 +245,7 @@ class SiteHistory:
             except Error as error:
                 why = error or "no answer"
                 self._say(f"waits for the stream {name}, which a gather or skyless hub apply makes: {why}")
-                await asyncio.sleep(_STREAM_RETRY_S)
+                await asyncio.sleep(2.0)
         made = f"{self._writer.source} {found.created}"
         if intake.place.stream not in {"", made}:
             self._say(f"the stream {name} was deleted and made again; it is taken from its beginning")

@@ -207,7 +207,6 @@ _CONTACT_MS: Final = {False: (1000, 5), True: (10_000, 6)}
 """Length in ms of the intervals in which fixes are compared, and longest interruption of a contact in such intervals,
 by whether days are thinned.
 """
-_FETCHED: Final = 10_000
 _PART_S: Final = 28.0 * 86_400.0
 _NAMED: Final = 5
 """How many known names an error lists."""
@@ -557,7 +556,7 @@ def _stream(sql: str, files: Iterable[Path], span: Span, **more: object) -> Iter
     if parameters["files"]:
         with _connection() as duck:
             found = duck.execute(sql, parameters)
-            while rows := found.fetchmany(_FETCHED):
+            while rows := found.fetchmany(10_000):
                 yield from rows
 
 
@@ -587,7 +586,6 @@ def _of_days(files: Iterable[Path], span: Span) -> list[Path]:
 
 
 def _are_thinned(files: Iterable[Path]) -> bool:
-    """Whether any of the files is thinned."""
     return any(THINNED in (parquet.read_schema(file).metadata or {}) for file in files)
 
 

@@ -34,8 +34,6 @@ from skyless.site.survey.anchor_errors import DifferenceCalibration
 TDOA_SITE: Final = 0
 """Site number in the topics of a system without a site identifier."""
 
-_METHOD: Final = "joint"
-
 _NEW_HEIGHT_M: Final = 0.05  # change of the anchors' mean height that restarts tracking
 
 PacketRadio = SnifferRadio | UciRadio | PhoneRadio
@@ -238,7 +236,7 @@ class PacketTags:
             node.fix_log.update_clock_offset()
             node.check_reception(time.monotonic())
             counted = node.fix_log.health(
-                method=_METHOD,
+                method="joint",
                 receptions=node.packets,
                 reason=str(node.tracking.reason),
                 counters=node.drops,
@@ -257,7 +255,6 @@ class PacketTags:
                 link.publish(health_topic(self._settings.site, "tag", node.radio.name), health)
 
     def _update_site(self) -> None:
-        """Update the site with the positions that the tags have received."""
         heard_m = dict(self._heard_m)
         for node in self.nodes:
             heard_m |= node.tracking.anchors_m

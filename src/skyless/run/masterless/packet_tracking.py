@@ -57,9 +57,7 @@ DL_TDOA: Final = EstimatorSettings(qa=DIFFERENCES.qa)
 """For FiRa radios, of which there are no recordings yet: a site with typical errors is assumed."""
 
 DL_TDOA_ONE_WAY: Final = DL_TDOA.changed(
-    pair_std_m=0.0,
-    survey_std_m=0.0,
-    range_std_m=sqrt(DL_TDOA.range_std_m**2 + 3.0 * DL_TDOA.survey_std_m**2),
+    pair_std_m=0.0, survey_std_m=0.0, range_std_m=sqrt(DL_TDOA.range_std_m**2 + 3.0 * DL_TDOA.survey_std_m**2)
 )
 """The same if only one anchor of each pair relays the other. The constant error of their range cannot be separated from
 their clocks then, so it counts, with the survey's, as an error of the tag's range."""

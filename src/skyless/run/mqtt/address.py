@@ -245,7 +245,6 @@ def may_subscribe(user: str | None, topic_filter: str) -> bool | None:
 USERS: Final = tuple(role for role in Role if role is not Role.STRANGER)
 """Roles with a password."""
 
-_PASSWORD_BYTES: Final = 24
 _PASSWORD_LINE: Final = re.compile(r"[A-Za-z0-9_-]{12,200}")
 """Characters without a meaning to a shell, systemd or nats-server."""
 _PLAIN_ADDRESS: Final = re.compile(r"[\w.:@/\[\]-]+", re.ASCII)
@@ -275,7 +274,7 @@ def _text(role: Role, address: MqttAddress) -> str:
     return (
         f"# Skyless: the role {role} at the MQTT broker (docs/mqtt.md). Only for machines of this role.\n"
         f"SKYLESS_MQTT={address}\n"
-        f"{PASSWORD_VARIABLE}={secrets.token_urlsafe(_PASSWORD_BYTES)}\n"
+        f"{PASSWORD_VARIABLE}={secrets.token_urlsafe(24)}\n"
     )
 
 

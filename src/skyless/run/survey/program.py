@@ -69,9 +69,6 @@ _SHOWN_PAIRS_PER_S: Final = 200
 _LAG_S: Final = 30.0
 """The quickest message counts for up to twice this time; then a host's clock that was set back is noticed."""
 
-_MAX_WAITING_BLOCKS: Final = 100_000  # a minute of a site with 50 anchors
-_MAX_WAITING_LEGS: Final = 100_000
-
 FactsOf = Callable[[Site], Facts]
 """Returns the facts about a site that are known without a user's help."""
 
@@ -290,8 +287,8 @@ class _Watched:
     """A watch, its unprocessed ranges, and its last result."""
 
     def __init__(self, watch: AnchorWatch) -> None:
-        self.waiting: deque[PairBlock] = deque(maxlen=_MAX_WAITING_BLOCKS)
-        self.waiting_legs: deque[AnchorLeg] = deque(maxlen=_MAX_WAITING_LEGS)
+        self.waiting: deque[PairBlock] = deque(maxlen=100_000)  # a minute of a site with 50 anchors
+        self.waiting_legs: deque[AnchorLeg] = deque(maxlen=100_000)
         self.seen: tuple[Literal["learning", "watching", "no data"], tuple[Finding, ...], int] = ("no data", (), 0)
         self._watch, self._phases = watch, PhaseWatch()
 
@@ -484,7 +481,6 @@ class SurveyNode:
             self.link.forget(topic(self._settings.site_id))
 
     def _begin(self, site: Site) -> None:
-        """Start surveying a site."""
         record = record_of(self._settings.file, site, self._log)
         try:
             facts = self._facts_of(site) if self._given is None else self._given.facts

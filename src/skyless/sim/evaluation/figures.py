@@ -230,7 +230,6 @@ MAX_GAP_S: Final = 1.0
 """Longer gaps in the table have no truth."""
 
 _WIDEST_OFFSET_S: Final = 5.0
-_OFFSET_STEPS_S: Final = (0.1, 0.01, 0.001)
 _OFFSET_ROWS: Final = 5_000
 """Fixes used to estimate an offset, an even sample."""
 
@@ -308,7 +307,7 @@ def estimated_offset_s(truth: Truth, times_s: Vector, position_m: Matrix) -> flo
         return float(np.median(error_m[known])) if 2 * known.sum() > len(error_m) else np.inf
 
     best_s, around_s, misfits = 0.0, _WIDEST_OFFSET_S, [np.inf]
-    for step_s in _OFFSET_STEPS_S:
+    for step_s in (0.1, 0.01, 0.001):
         offsets_s = best_s + np.arange(-around_s, around_s + step_s / 2.0, step_s)
         found = [misfit_m(offset_s) for offset_s in offsets_s]
         misfits = found if around_s == _WIDEST_OFFSET_S else misfits

@@ -40,7 +40,6 @@ class Limits(Struct, frozen=True):
         return math.isfinite(value) and enough and value <= self.high
 
     def __str__(self) -> str:
-        """Description for error messages."""
         noun = "a whole number" if self.whole else "a number"
         unit = f" of {self.unit}" if self.unit else ""
         if self.above:
@@ -219,11 +218,7 @@ def plan_files(site: Site, file: Path) -> dict[int | None, Path]:
 
 
 def check_floor_plans(site: Site, file: Path) -> None:
-    """Check that the images of all floors are readable PNGs or JPEGs.
-
-    Raises:
-        ConfigurationError: one is not.
-    """
+    """Check that the images of all floors are readable PNGs or JPEGs. Raises ConfigurationError if one is not."""
     if site.floor_plan is not None:
         _check_image(file, "floor_plan.image", site.floor_plan.image)
     for row, floor in enumerate(() if site.floors is UNSET else site.floors):
@@ -404,10 +399,15 @@ def _check_times(site: Site, file: Path) -> None:
 # Images of the floor
 
 
-_PNG: Final = b"\x89PNG\r\n\x1a\n"
-_JPEG: Final = b"\xff\xd8\xff"
 _STANDALONE: Final = frozenset({0x01, *range(0xD0, 0xD8)})
 _START_OF_FRAME: Final = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
+
+
+def image_kind(data: bytes) -> str | None:
+    """``png`` or ``jpeg``, by the first bytes; None for other files."""
+    if data.startswith(b"\x89PNG\r\n\x1a\n"):
+        return "png"
+    return "jpeg" if data.startswith(b"\xff\xd8\xff") else None
 
 
 def image_size(data: bytes) -> tuple[int, int] | None:
@@ -415,12 +415,11 @@ def image_size(data: bytes) -> tuple[int, int] | None:
 
     Sources: PNG (W3C, third edition) 11.2.2, JPEG (ITU-T T.81) B.1 and B.2.2.
     """
-    if data.startswith(_PNG):
+    kind = image_kind(data)
+    if kind == "png":
         is_whole = len(data) >= 24 and data[12:16] == b"IHDR"
         return _positive(int.from_bytes(data[16:20], "big"), int.from_bytes(data[20:24], "big")) if is_whole else None
-    if data.startswith(_JPEG):
-        return _jpeg_size(data)
-    return None
+    return _jpeg_size(data) if kind == "jpeg" else None
 
 
 def _jpeg_size(data: bytes) -> tuple[int, int] | None:

@@ -162,7 +162,6 @@ def _refuse_unknown_keys(path: Path, document: dict[str, Any]) -> None:
 
 
 def _refuse_unknown(path: Path, document: dict[str, Any], prefix: str, table: object, struct: type[Struct]) -> None:
-    """Refuse keys that a table cannot have."""
     if not isinstance(table, dict):
         return  # a wrong type, which the conversion reports
     known = [name for name in struct.__struct_fields__ if name != "unplaced"]

@@ -21,7 +21,6 @@ from skyless.site.planning.links import ANCHORS_IN_VIEW, FIX_SHARE, HDOP, PDOP, 
 from skyless.site.planning.maps import Grid, PlanMap
 from skyless.site.planning.rates import RateMap
 
-_NO_FIX: Final = "#d9d9d9"
 _EDGE: Final = "black"
 _FLAT: Final = 0.45  # floors with a smaller aspect ratio have the colour bar below them
 _PANEL_IN: Final = 8.0
@@ -213,7 +212,7 @@ def _slice(
     else:
         contours = []
     if without_fix.any():
-        axes.plot([], [], "s", color=_NO_FIX, label="no fix")
+        axes.plot([], [], "s", color="#d9d9d9", label="no fix")
     return mesh, contours
 
 

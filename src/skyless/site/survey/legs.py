@@ -360,8 +360,6 @@ _LONGEST_TICKS: Final = round(0.3 * TICK_RATE_HZ)
 _RATE_TICKS: Final = round(0.1 * TICK_RATE_HZ)
 """Least time over which a rate is measured, with the noise of two stamps."""
 
-_MAX_BEFORE: Final = 256
-
 
 class RelayedDifference(Struct, frozen=True, gc=False):
     """A time difference, valid at the moment when the tag received ``first``."""
@@ -403,7 +401,7 @@ class RelayedDifferences:
 
         It includes the tag's motion, so that differences apply to one moment.
         """
-        before = self._before.setdefault(beacon.anchor, deque(maxlen=_MAX_BEFORE))
+        before = self._before.setdefault(beacon.anchor, deque(maxlen=256))
         while before and now_ticks - before[0][1] > _LONGEST_TICKS:
             before.popleft()
         rate = None

@@ -28,7 +28,7 @@ from skyless.core.errors import ConfigurationError, SkylessError, writing
 from skyless.core.site import AccuracySite, AnchorSite, FloorPlanSite, Site, UnplacedAnchor
 from skyless.core.ticks import TICK_M
 from skyless.files import replace_files
-from skyless.site.file.check import SITE_LIMITS, check_site, image_size
+from skyless.site.file.check import SITE_LIMITS, check_site, image_kind, image_size
 from skyless.site.file.load import load_site, with_values
 from skyless.site.survey.facts import PairRanges, Survey, SurveyedAnchor
 
@@ -36,7 +36,6 @@ _DELAY: Final = SITE_LIMITS["anchors.tx_antenna_delay_ticks"]
 _MAX_STATED_M: Final = SITE_LIMITS["anchors.std_m"].high
 _RANGE_STD: Final = SITE_LIMITS["accuracy.range_std_m"]
 _STD_STEPS_PER_M: Final = 1e4
-_POSITION_DIGITS: Final = 4
 _KEYS: Final = ("x_m", "y_m", "z_m", "tx_antenna_delay_ticks", "std_m")
 
 
@@ -173,7 +172,7 @@ def _changes(before: AnchorSite | UnplacedAnchor, after: AnchorSite) -> dict[str
 
 def _rounded(value_m: float) -> float:
     """Round to a tenth of a millimetre, never to minus zero."""
-    return round(value_m, _POSITION_DIGITS) + 0.0
+    return round(value_m, 4) + 0.0
 
 
 def _up(value_m: float, steps_per_m: float) -> float:
@@ -211,11 +210,7 @@ def encode_record(record: SurveyRecord) -> bytes:
 
 
 def read_record(path: str | PathLike[str]) -> SurveyRecord:
-    """Read a survey record.
-
-    Raises:
-        ConfigurationError: the file cannot be read, or is not the record of a survey.
-    """
+    """Read a survey record. Raises ConfigurationError if the file cannot be read, or is not the record of a survey."""
     try:
         return msgspec.json.decode(Path(path).read_bytes(), type=SurveyRecord)
     except OSError as error:
@@ -237,7 +232,6 @@ def baseline(record: SurveyRecord) -> PairRanges:
 # Files: the site file, the record next to it, and the image of the floor.
 
 _NEAR_M: Final = 1e-3
-_ENDINGS: Final = {b"\x89PNG": ".png"}
 
 
 class FloorImage(Struct, frozen=True):
@@ -351,7 +345,7 @@ def _floor_image(file: Path, site: Site, floor: FloorImage) -> tuple[str | None,
         return present, {}
     if present is not None and (file.parent / present).read_bytes() == floor.image:
         return present, {}
-    path = file.with_name(f"{file.stem}.floor{_ENDINGS.get(floor.image[:4], '.jpg')}")
+    path = file.with_name(f"{file.stem}.floor{'.png' if image_kind(floor.image) == 'png' else '.jpg'}")
     if path.exists() and path.read_bytes() != floor.image:
         path = path.with_stem(f"{path.stem}-{crc32(floor.image):08x}")
     return path.name, {path: floor.image}

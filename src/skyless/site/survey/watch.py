@@ -301,7 +301,6 @@ class AnchorWatch:
         return np.asarray(self._history.windows >= min(self._learning_windows, _USUAL_WINDOWS // 2))
 
     def _conclude(self, window: int, blocks: dict[int, list[PairBlock]]) -> None:
-        """Evaluate one window."""
         self._has_data = bool(blocks)
         start_s = window * self._window_s
         range_m, exchanges = self._ranges(blocks)
