@@ -187,8 +187,7 @@ def test_pairs_are_the_anchors_with_two_packets_of_which_the_newer_is_recent():
 
 
 @pytest.mark.parametrize(
-    ("sequence", "count", "link"),
-    [(5, 2, 30 * MS), (4, 2, 20 * MS), (6, 2, None), (5, 1, 30 * MS), (4, 1, None)],
+    ("sequence", "count", "link"), [(5, 2, 30 * MS), (4, 2, 20 * MS), (6, 2, None), (5, 1, 30 * MS), (4, 1, None)]
 )
 def test_a_relay_of_a_packet_that_the_tag_has_received_is_a_link(sequence, count, link):
     q = with_packets(20 * MS, 30 * MS)

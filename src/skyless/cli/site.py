@@ -74,8 +74,7 @@ class NewOptions(JsonOptions, frozen=True, kw_only=True):
     paper: bool = False
     """Use the paper's protocol (mode master): the anchor that the others receive best is the master."""
     phases: bool = False
-    """Let anchors relay the phases of the carrier that their radios measure (DW1000), for tags that know their way to
-    millimetres; as many beacons as fit are what tags in hands need."""
+    """Let anchors relay carrier phases (DW1000), at the rate that tags in hands need to lock: as many as fit."""
     tag_height: str | None = None
     """The tags' height: metres, at which all of them move (2-D), or free, the default: estimated (3-D). With --spacing,
     whose anchors lie in one plane, the default is 1.2."""

@@ -140,10 +140,7 @@ class Fix(Struct, frozen=True, gc=False):
 
     @property
     def hypotheses(self) -> int:
-        """Number of positions that are possible by carrier phases: 1 once they are locked, 0 if they are not in use.
-
-        While there are several, phases are locking: the position is the mean, and the covariance covers all of them.
-        """
+        """Positions that are possible by carrier phases: 1 when locked, several while locking, 0 if none are in use."""
         return int(_row(self.rows, ORIENTATION + 1)[2]) if len(self.rows) > (ORIENTATION + 1) * ROW_BYTES else 0
 
     @property

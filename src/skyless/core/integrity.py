@@ -38,11 +38,7 @@ class Integrity(Struct, frozen=True, gc=False):
 
 
 class IntegrityRequirement(Struct, frozen=True):
-    """An application's requirements for the levels.
-
-    Raises:
-        ValueError: a field is out of range.
-    """
+    """An application's requirements for the levels. Raises ValueError: a field is out of range."""
 
     risk: float = RISK
     """Probability, for each fix, that an error exceeds its protection level."""

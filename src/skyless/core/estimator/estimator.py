@@ -15,24 +15,9 @@ from skyless.core.estimator.compiled import add_anchor, find_anchor, fit_plane, 
 from skyless.core.estimator.faults import horizontal_variance_m2, is_late_often, rejects_most
 from skyless.core.estimator.kalman import has_phase
 from skyless.core.estimator.motion import GRAVITY_MPS2, heading_std_rad
-from skyless.core.estimator.process import (
-    REJECTED,
-    BatchPacket,
-    BatchRow,
-    Packet,
-    Place,
-    Relay,
-    Relays,
-)
+from skyless.core.estimator.process import REJECTED, BatchPacket, BatchRow, Packet, Place, Relay, Relays
 from skyless.core.estimator.settings import TUNING, EstimatorSettings
-from skyless.core.estimator.state import (
-    ALL_RANGE_ERRORS,
-    State,
-    at,
-    covariances,
-    make_uncertain,
-    new_state,
-)
+from skyless.core.estimator.state import ALL_RANGE_ERRORS, State, at, covariances, make_uncertain, new_state
 from skyless.core.motion_sample import MotionSample
 from skyless.core.native.records import MAX_RELAYS
 from skyless.core.native.views import records, view
@@ -167,13 +152,7 @@ class Estimator:
         """State the levels as ``CONTRADICTED`` or ``UNAVAILABLE`` from now on; ``SOUND``: as the filter finds them."""
         self._state.status.withheld = state
 
-    def start(
-        self,
-        rx_ticks: int,
-        position_m: Vector,
-        covariance_m2: Matrix,
-        speed_variance: float,
-    ) -> None:
+    def start(self, rx_ticks: int, position_m: Vector, covariance_m2: Matrix, speed_variance: float) -> None:
         """Start without anchors at a position, shapes (dim,) and (dim, dim); the share of late packets is kept.
 
         ``position_m`` may continue with a known velocity, ``covariance_m2`` with its covariance.

@@ -5,8 +5,6 @@ the same variance. So the states that result have one P in common, and differ fr
 vector each. These deviations are columns of V behind those of the faults, and every time update and measurement update
 treats them as such: the innovation of a hypothesis is ν − h·deviation. Its weight is the likelihood of all stamps and
 phases since. An unlikely hypothesis is dropped, and only the most likely ones are kept.
-
-What is known of the tag is x with P plus the scatter of the hypotheses.
 """
 
 from skyless.core.estimator.kalman import compute_fault_input, update
@@ -130,8 +128,6 @@ def scatter(s: State, state: int, other: int) -> float:
 def give_up_hypotheses(s: State) -> None:
     """Replace all hypotheses by their mean. P gains their scatter."""
     hypotheses, first = s.hypotheses, FAULT_KINDS * s.count
-    if hypotheses.count == 0:
-        return
     for state in range(s.used):
         row, effects = row_of(state), s.V[state]
         for other in range(row_end(state, s.n)):

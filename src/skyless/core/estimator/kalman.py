@@ -96,9 +96,8 @@ def follows_cycles(s: State) -> bool:
 
 def are_phases_reliable(s: State) -> bool:
     """Whether phases are in use, are rarely wild, and range errors have not jumped of late: cycles may be uncertain."""
-    if PHASE_STATES > 0 and s.status.has_phases:
-        return s.status.wild_share < s.tuning.most_wild and jump_share(s) < 1.0
-    return False
+    has_phases = PHASE_STATES > 0 and s.status.has_phases
+    return has_phases and s.status.wild_share < s.tuning.most_wild and jump_share(s) < 1.0
 
 
 def _unseen_noise(s: State) -> float:

@@ -285,12 +285,12 @@ def learn_least_walk(s: State) -> None:
             square_sum += square(change_mps - mean) * (found - 1) / found
             mean += (change_mps - mean) / found
     if found > s.dim:
-        walk_s = 3.0 / (elapsed_s + status.rate_s)
+        walk_s = 1.5 / elapsed_s
         status.rate_changes += 1
         gain = 1.0 / min(status.rate_changes, int(tuning.rate_changes))
         status.tag_walk += gain * (square(mean) * walk_s - status.tag_walk)
         status.anchors_walk += gain * (square_sum / (found - 1) * walk_s - status.anchors_walk)
-    status.rate_ticks, status.rate_s = status.epoch_ticks, elapsed_s
+    status.rate_ticks = status.epoch_ticks
 
 
 def covariance_scale(s: State) -> float:

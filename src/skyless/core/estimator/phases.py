@@ -9,9 +9,8 @@ reflections, which changes as the tag walks. It is estimated as a real number: a
 anchors turn, and ranges known to millimetres up to a constant determine the position. ``docs/maths.md`` section 6.7.
 
 A wrong cycle in fast motion looks consistent and drags the position by metres. So a phase is used only together with a
-stamp that was used. If it is not predicted to a tenth of a wavelength, it is taken at each cycle that is possible
-(``hypotheses``); where these are too many, or phases are often wrong, its ambiguity starts again, which provides no
-information. If stamps contradict the state, or the hypotheses stay apart, all ambiguities start again.
+stamp that was used. If it is not predicted to a tenth of a wavelength, it is taken at each possible cycle
+(``hypotheses``); if these are too many, or phases often wrong, its ambiguity starts again, without any information.
 """
 
 from typing import Final
@@ -45,9 +44,6 @@ CYCLE_TICKS: Final = 128
 """Number of ticks with a whole number of carrier cycles in every channel: ``EstimatorSettings.carrier_cycles``."""
 _TWO_PI: Final = 6.283185307179586
 
-PHASE_BEGINS, PHASE_REFUSED, PHASE_USED = range(3)
-"""Outcomes of a phase."""
-
 
 def own_phase(s: State, anchor: int, phase_cycles: float) -> None:
     """Process the phase, in [0, 1), of a reception of the tag's whose stamp was used. It falls as stamps grow."""
@@ -70,10 +66,10 @@ def own_phase(s: State, anchor: int, phase_cycles: float) -> None:
     innovation, variance = _innovation_m(s, cycles, expected_m), status.phase_variance_m2
     predicted = compute_ph(s)
     is_telling = a.own.is_known and square(s.settings.gate) * (predicted + variance) < square(_wavelength_m(s))
-    outcome = _use_phase(s, ambiguity, a.own, innovation, variance, True)
+    is_used = _use_phase(s, ambiguity, a.own, innovation, predicted, variance, True)
     if is_telling:
         _count_wild(s, predicted + variance)
-    if outcome == PHASE_USED and predicted <= _certain_m2(s) and s.hypotheses.count == 0:
+    if is_used and predicted <= _certain_m2(s) and s.hypotheses.count == 0:
         _learn_noise(s, square(innovation) - predicted)
 
 
@@ -97,8 +93,8 @@ def relay_phase(s: State, listener: int, sender: int, packet_rx_ticks: Ticks, ph
     cycles = -phase_cycles - _whole_cycles(s, j.offset_ticks - i.offset_ticks)
     variance = square(s.tuning.phase_mesh_std_m) + relay_variance(s, listener, sender, age_s) - settings.rx_variance_m2
     innovation = _innovation_m(s, cycles, expected_m + s.x[where.mesh + listener])
-    is_slow = s.status.recent_square < square(s.tuning.phase_slow_mps)
-    _use_phase(s, where.mesh + listener, i.mesh, innovation, variance, is_slow)
+    is_slow = s.status.recent_square < 4.0 * square(s.tuning.phase_walking_mps)  # a fast tag's own need all hypotheses
+    _use_phase(s, where.mesh + listener, i.mesh, innovation, compute_ph(s), variance, is_slow)
 
 
 def _whole_cycles(s: State, ticks: Ticks) -> float:
@@ -121,13 +117,14 @@ def _innovation_m(s: State, cycles: float, expected_m: float) -> float:
     return (off - floor(off + 0.5)) * _wavelength_m(s)
 
 
-def _use_phase(s: State, state: int, one: Ambiguity, innovation: float, variance: float, may_be_several: bool) -> int:
-    """Process the phase in ``h``, whose last term is its ambiguity, the state of that index.
+def _use_phase(
+    s: State, state: int, one: Ambiguity, innovation: float, predicted: float, variance: float, may_be_several: bool
+) -> bool:
+    """Process the phase in ``h``, whose last term is its ambiguity, the state of that index. Returns False if unused.
 
-    ``may_be_several``: whether it may be taken at several cycles.
+    ``predicted``: hᵀ·P·h, as ``compute_ph`` found it; ``may_be_several``: whether it may be taken at several cycles.
     """
     status = s.status
-    predicted = compute_ph(s)
     one.ticks = status.epoch_ticks
     is_certain, within_m2 = predicted <= _certain_m2(s), square(s.settings.gate) * (predicted + variance)
     if is_certain:
@@ -138,22 +135,21 @@ def _use_phase(s: State, state: int, one: Ambiguity, innovation: float, variance
             off_m = innovation + cycle * _wavelength_m(s)
             s.hypotheses.fit += exp(-0.5 * square(off_m) / (predicted + variance))
         _open(s, state, one, innovation, variance)
-        return PHASE_BEGINS
+        return False
     if not take_cycles(s, innovation, predicted + variance, sqrt(within_m2), _wavelength_m(s)):
         status.phases_refused += 1
         one.refused_in_row += 1
         if one.refused_in_row >= int(s.tuning.phases_in_row):
             _open(s, state, one, innovation, variance)
-        return PHASE_REFUSED
+        return False
     one.refused_in_row = 0
     status.phases_used += 1
-    return PHASE_USED
+    return True
 
 
 def _are_few(s: State, within_m2: float) -> bool:
     """Whether the cycles within a distance are few enough, and phases so reliable, that hypotheses are of use."""
-    is_short = 4.0 * within_m2 < square(s.tuning.most_cycles * _wavelength_m(s))
-    return is_short and are_phases_reliable(s)
+    return 4.0 * within_m2 < square(s.tuning.most_cycles * _wavelength_m(s)) and are_phases_reliable(s)
 
 
 def _limit_m2(s: State, variance: float) -> float:

@@ -22,15 +22,7 @@ from skyless.core.estimator.measurements import (
 from skyless.core.estimator.monitor import motion_covariance, update_stationary
 from skyless.core.estimator.motion import fill_orientation, look_at_sensor, move
 from skyless.core.estimator.phases import close_phases, own_phase, relay_phase
-from skyless.core.estimator.state import (
-    AXES,
-    LEVELS,
-    State,
-    add_anchor,
-    at,
-    find_anchor,
-    remove_anchor,
-)
+from skyless.core.estimator.state import AXES, LEVELS, State, add_anchor, at, find_anchor, remove_anchor
 from skyless.core.fix import ORIENTATION, POSITION, PROTECTION, QUALITY, VELOCITY
 from skyless.core.integrity import HPL, STATE, VPL
 from skyless.core.native.records import (

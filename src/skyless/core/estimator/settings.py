@@ -305,8 +305,6 @@ class Tuning(Record):
     """Share of wild phases that is expected at least, so that they can be found."""
     most_wild: float = 0.01
     """Share beyond which hypotheses on cycles are misleading."""
-    phase_slow_mps: float = 1.4
-    """Speed beyond which relayed phases are not taken at several cycles: the tag's own need all hypotheses [m/s]."""
     unlikely_log_odds: float = 14.0
     """Logarithm of the odds against a hypothesis beyond which it is dropped."""
     apart_m: float = 0.03

@@ -361,8 +361,6 @@ class Status(Record):
     """Whether phases are in use, so that there are ambiguities."""
     rate_ticks: Ticks
     """Tag time at which rates of clocks were compared."""
-    rate_s: float
-    """Time from the comparison before."""
     rate_changes: Count
     anchors_walk: float
     """Random walk of the anchors' clocks by changes of their rates [m²/s³]."""

@@ -246,10 +246,7 @@ class Verifier:
         return frame
 
     def decided(self) -> list[tuple[ReceivedFrame, Fault | None]]:
-        """Newly decided frames in order of reception, each once.
-
-        The fault is None for a genuine frame.
-        """
+        """Newly decided frames in order of reception, each once. The fault is None for a genuine frame."""
         by_code: list[tuple[ReceivedFrame, Fault | None]] = []
         waiting = self._waiting
         oldest = self.newest_ticks - LONGEST_WAIT_TICKS

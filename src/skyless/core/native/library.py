@@ -104,11 +104,7 @@ def _address_type(element: Any) -> type:  # noqa: ANN401 - types have no type
     class Address:
         @classmethod
         def from_param(cls, array: Any) -> Any:  # noqa: ANN401 - arrays of several libraries
-            """Convert an array to a C argument.
-
-            Raises:
-                TypeError: it has other elements, or is not contiguous.
-            """
+            """Convert an array to a C argument. Raises TypeError: it has other elements, or is not contiguous."""
             if getattr(array, "_type_", None) is element or (isinstance(array, bytes) and element is ctypes.c_uint8):
                 return ctypes.c_void_p.from_param(array)
             if not isinstance(array, np.ndarray):

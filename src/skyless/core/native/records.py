@@ -18,18 +18,7 @@ An element that is itself an array or a record is a reference: ``row = P[one]`` 
 import ctypes
 from collections.abc import Iterator
 from math import nan
-from typing import (
-    Annotated,
-    Any,
-    ClassVar,
-    Final,
-    Protocol,
-    Self,
-    TypeVar,
-    get_args,
-    get_origin,
-    get_type_hints,
-)
+from typing import Annotated, Any, ClassVar, Final, Protocol, Self, TypeVar, get_args, get_origin, get_type_hints
 
 Value = TypeVar("Value")
 Read_co = TypeVar("Read_co", covariant=True)
@@ -94,11 +83,7 @@ class Record(ctypes.Structure):
         self._set(values)
 
     def changed(self, **values: Any) -> Self:  # noqa: ANN401 - of fields
-        """A copy with other values in these fields.
-
-        Raises:
-            TypeError: there is no such field.
-        """
+        """A copy with other values in these fields. Raises TypeError: there is no such field."""
         copy = type(self).from_buffer_copy(self)
         copy._set(values)
         return copy

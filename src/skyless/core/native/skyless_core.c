@@ -324,7 +324,7 @@ INTERNAL real whole_cycles(State *s, int64_t ticks);
 INTERNAL real wavelength_m(State *s);
 INTERNAL real certain_m2(State *s);
 INTERNAL real innovation_m(State *s, real cycles, real expected_m);
-INTERNAL int32_t use_phase(State *s, int32_t state, Ambiguity *one, real innovation, real variance, bool
+INTERNAL bool use_phase(State *s, int32_t state, Ambiguity *one, real innovation, real predicted, real variance, bool
         may_be_several);
 INTERNAL bool are_few(State *s, real within_m2);
 INTERNAL real limit_m2(State *s, real variance);
@@ -2199,10 +2199,8 @@ INTERNAL bool follows_cycles(State *s) {
 
 /* Whether phases are in use, are rarely wild, and range errors have not jumped of late: cycles may be uncertain. */
 INTERNAL bool are_phases_reliable(State *s) {
-    if (PHASE_STATES > 0 && s->status.has_phases) {
-        return s->status.wild_share < s->tuning.most_wild && jump_share(s) < REAL(1.0);
-    }
-    return false;
+    bool has_phases = PHASE_STATES > 0 && s->status.has_phases;
+    return has_phases && s->status.wild_share < s->tuning.most_wild && jump_share(s) < REAL(1.0);
 }
 
 /* The same of what a motion sensor does not show. */
@@ -2998,9 +2996,7 @@ INTERNAL bool fits_settings(State *s) {
  * the same variance. So the states that result have one P in common, and differ from their weighted mean, which is x, by a
  * vector each. These deviations are columns of V behind those of the faults, and every time update and measurement update
  * treats them as such: the innovation of a hypothesis is ν − h·deviation. Its weight is the likelihood of all stamps and
- * phases since. An unlikely hypothesis is dropped, and only the most likely ones are kept.
- *
- * What is known of the tag is x with P plus the scatter of the hypotheses. */
+ * phases since. An unlikely hypothesis is dropped, and only the most likely ones are kept. */
 
 /* Process the phase in ``h`` at each cycle within a limit, for each hypothesis. Returns False if there is none.
  *
@@ -3153,9 +3149,6 @@ INTERNAL real scatter(State *s, int32_t state, int32_t other) {
 INTERNAL void give_up_hypotheses(State *s) {
     Hypotheses *hypotheses = &s->hypotheses;
     int32_t first = FAULT_KINDS * s->count;
-    if (hypotheses->count == 0) {
-        return;
-    }
     for (int32_t state = 0, state_end = s->used; state < state_end; state++) {
         int32_t row = row_of(state);
         real *effects = s->V[state];
@@ -3488,14 +3481,13 @@ INTERNAL void learn_least_walk(State *s) {
         }
     }
     if (found > s->dim) {
-        real walk_s = REAL(3.0) / (elapsed_s + status->rate_s);
+        real walk_s = REAL(1.5) / elapsed_s;
         status->rate_changes += 1;
         real gain = REAL(1.0) / (real)min_64(status->rate_changes, truncated(tuning->rate_changes));
         status->tag_walk += gain * (square(mean) * walk_s - status->tag_walk);
         status->anchors_walk += gain * (square_sum / (real)(found - 1) * walk_s - status->anchors_walk);
     }
     status->rate_ticks = status->epoch_ticks;
-    status->rate_s = elapsed_s;
 }
 
 /* Factor on the position's covariance while innovations are larger than expected.
@@ -5019,9 +5011,8 @@ INTERNAL void measure_speed(State *s, real dt) {
  * anchors turn, and ranges known to millimetres up to a constant determine the position. ``docs/maths.md`` section 6.7.
  *
  * A wrong cycle in fast motion looks consistent and drags the position by metres. So a phase is used only together with a
- * stamp that was used. If it is not predicted to a tenth of a wavelength, it is taken at each cycle that is possible
- * (``hypotheses``); where these are too many, or phases are often wrong, its ambiguity starts again, which provides no
- * information. If stamps contradict the state, or the hypotheses stay apart, all ambiguities start again. */
+ * stamp that was used. If it is not predicted to a tenth of a wavelength, it is taken at each possible cycle
+ * (``hypotheses``); if these are too many, or phases often wrong, its ambiguity starts again, without any information. */
 
 /* Process the phase, in [0, 1), of a reception of the tag's whose stamp was used. It falls as stamps grow. */
 INTERNAL void own_phase(State *s, int32_t anchor, real phase_cycles) {
@@ -5049,11 +5040,11 @@ INTERNAL void own_phase(State *s, int32_t anchor, real phase_cycles) {
     real variance = status->phase_variance_m2;
     real predicted = compute_ph(s);
     bool is_telling = a->own.is_known && square(s->settings.gate) * (predicted + variance) < square(wavelength_m(s));
-    int32_t outcome = use_phase(s, ambiguity, &a->own, innovation, variance, true);
+    bool is_used = use_phase(s, ambiguity, &a->own, innovation, predicted, variance, true);
     if (is_telling) {
         count_wild(s, predicted + variance);
     }
-    if (outcome == PHASE_USED && predicted <= certain_m2(s) && s->hypotheses.count == 0) {
+    if (is_used && predicted <= certain_m2(s) && s->hypotheses.count == 0) {
         learn_noise(s, square(innovation) - predicted);
     }
 }
@@ -5083,8 +5074,8 @@ INTERNAL void relay_phase(State *s, int32_t listener, int32_t sender, int64_t pa
     real variance = square(s->tuning.phase_mesh_std_m) + relay_variance(s, listener, sender, age_s) -
             settings->rx_variance_m2;
     real innovation = innovation_m(s, cycles, expected_m + s->x[where->mesh + listener]);
-    bool is_slow = s->status.recent_square < square(s->tuning.phase_slow_mps);
-    use_phase(s, where->mesh + listener, &i->mesh, innovation, variance, is_slow);
+    bool is_slow = s->status.recent_square < REAL(4.0) * square(s->tuning.phase_walking_mps);  /* a fast tag's own need all hypotheses */
+    use_phase(s, where->mesh + listener, &i->mesh, innovation, compute_ph(s), variance, is_slow);
 }
 
 /* Fractional cycles, in [0, 1), of a number of ticks. */
@@ -5108,13 +5099,12 @@ INTERNAL real innovation_m(State *s, real cycles, real expected_m) {
     return (off - (real)floor_real(off + REAL(0.5))) * wavelength_m(s);
 }
 
-/* Process the phase in ``h``, whose last term is its ambiguity, the state of that index.
+/* Process the phase in ``h``, whose last term is its ambiguity, the state of that index. Returns False if unused.
  *
- * ``may_be_several``: whether it may be taken at several cycles. */
-INTERNAL int32_t use_phase(State *s, int32_t state, Ambiguity *one, real innovation, real variance, bool may_be_several)
-        {
+ * ``predicted``: hᵀ·P·h, as ``compute_ph`` found it; ``may_be_several``: whether it may be taken at several cycles. */
+INTERNAL bool use_phase(State *s, int32_t state, Ambiguity *one, real innovation, real predicted, real variance, bool
+        may_be_several) {
     Status *status = &s->status;
-    real predicted = compute_ph(s);
     one->ticks = status->epoch_ticks;
     bool is_certain = predicted <= certain_m2(s);
     real within_m2 = square(s->settings.gate) * (predicted + variance);
@@ -5128,7 +5118,7 @@ INTERNAL int32_t use_phase(State *s, int32_t state, Ambiguity *one, real innovat
             s->hypotheses.fit += exp_(-REAL(0.5) * square(off_m) / (predicted + variance));
         }
         open(s, state, one, innovation, variance);
-        return PHASE_BEGINS;
+        return false;
     }
     if (!take_cycles(s, innovation, predicted + variance, SQRT(within_m2), wavelength_m(s))) {
         status->phases_refused += 1;
@@ -5136,17 +5126,16 @@ INTERNAL int32_t use_phase(State *s, int32_t state, Ambiguity *one, real innovat
         if (one->refused_in_row >= truncated(s->tuning.phases_in_row)) {
             open(s, state, one, innovation, variance);
         }
-        return PHASE_REFUSED;
+        return false;
     }
     one->refused_in_row = 0;
     status->phases_used += 1;
-    return PHASE_USED;
+    return true;
 }
 
 /* Whether the cycles within a distance are few enough, and phases so reliable, that hypotheses are of use. */
 INTERNAL bool are_few(State *s, real within_m2) {
-    bool is_short = REAL(4.0) * within_m2 < square(s->tuning.most_cycles * wavelength_m(s));
-    return is_short && are_phases_reliable(s);
+    return REAL(4.0) * within_m2 < square(s->tuning.most_cycles * wavelength_m(s)) && are_phases_reliable(s);
 }
 
 /* Squared innovation beyond which a phase is more likely random than noisy, or may be off by a cycle. */
@@ -7800,11 +7789,11 @@ SKYLESS_EXPORT void skyless_begin_tag(Tag *t, int32_t site, real qa, real lowest
             .zero_variance_m2 = REAL(10000.0), .phase_start_std_m = REAL(0.002), .phase_max_std_m = REAL(0.006),
             .phase_mesh_std_m = REAL(0.0012), .phase_wander = REAL(25.0), .phase_gate = REAL(0.35), .phase_share =
             REAL(0.1), .phase_step_m = REAL(0.02), .most_cycles = REAL(3.0), .start_wild = REAL(0.009), .least_wild =
-            REAL(0.002), .most_wild = REAL(0.01), .phase_slow_mps = REAL(1.4), .unlikely_log_odds = REAL(14.0), .apart_m
-            = REAL(0.03), .phase_walking_mps = REAL(0.7), .speed_memory_s = REAL(1.0), .phases_in_row = REAL(4.0),
-            .uncovered_chi2 = REAL(240.0), .max_open_level_std = REAL(0.02), .contradicted_start_s = REAL(5.0), .probe_m
-            = REAL(1.0), .shift_part = REAL(0.25), .apart_chi2 = REAL(20.0), .sensor_valid_s = REAL(1.0)}, .is_starting
-            = true, .misfit = -1, .relays_may_contradict = true, .may_begin_again = true};
+            REAL(0.002), .most_wild = REAL(0.01), .unlikely_log_odds = REAL(14.0), .apart_m = REAL(0.03),
+            .phase_walking_mps = REAL(0.7), .speed_memory_s = REAL(1.0), .phases_in_row = REAL(4.0), .uncovered_chi2 =
+            REAL(240.0), .max_open_level_std = REAL(0.02), .contradicted_start_s = REAL(5.0), .probe_m = REAL(1.0),
+            .shift_part = REAL(0.25), .apart_chi2 = REAL(20.0), .sensor_valid_s = REAL(1.0)}, .is_starting = true,
+            .misfit = -1, .relays_may_contradict = true, .may_begin_again = true};
     t->owner.qa = qa;
     t->owner.lowest_m = lowest_m;
     t->owner.highest_m = highest_m;

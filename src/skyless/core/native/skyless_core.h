@@ -338,15 +338,12 @@ typedef double real;
 /* A type, then 16 bytes of contents. */
 #define PAGE_BYTES 17
 #define PAGE_KINDS 4
-#define PHASE_BEGINS 0
-#define PHASE_REFUSED 1
 /* States of each anchor for carrier phases; 0 if they are not used. */
 #ifndef PHASE_STATES
 #define PHASE_STATES 2
 #endif
 /* Phase steps in a cycle; also the bit that marks the presence of a phase. */
 #define PHASE_STEPS 128
-#define PHASE_USED 2
 /* Squared differences of range errors are limited to this multiple of their mean, as jumps are not multipath. */
 #define PLACE_LIMIT REAL(2.0)
 #define PLACE_LIMITED_MEAN REAL(0.7421917)
@@ -860,8 +857,6 @@ typedef struct Tuning {
     real start_wild;
     real least_wild;  /* Share of wild phases that is expected at least, so that they can be found. */
     real most_wild;  /* Share beyond which hypotheses on cycles are misleading. */
-    /* Speed beyond which relayed phases are not taken at several cycles: the tag's own need all hypotheses [m/s]. */
-    real phase_slow_mps;
     real unlikely_log_odds;  /* Logarithm of the odds against a hypothesis beyond which it is dropped. */
     real apart_m;  /* Standard deviation of the positions of hypotheses beyond which they are given up [m]. */
     real phase_walking_mps;  /* The same as ``walking_mps`` while phases may be taken at several cycles [m/s] … */
@@ -1050,7 +1045,6 @@ typedef struct Status {
     real plane_normal[3];  /* Normal of that plane. */
     bool has_phases;  /* Whether phases are in use, so that there are ambiguities. */
     int64_t rate_ticks;  /* Tag time at which rates of clocks were compared. */
-    real rate_s;  /* Time from the comparison before. */
     int64_t rate_changes;
     real anchors_walk;  /* Random walk of the anchors' clocks by changes of their rates [m²/s³]. */
     real tag_walk;  /* The same of the tag's. */

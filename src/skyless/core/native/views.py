@@ -2,10 +2,7 @@
 
 import ctypes
 from functools import cache
-from typing import (
-    Any,
-    Final,
-)
+from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray

@@ -372,11 +372,7 @@ class Anchor:
         return wrap(tx_ticks)
 
     def transmission(self, tx_ticks: int) -> Transmission:
-        """The frame for the time last returned by ``next_transmission_ticks``.
-
-        Raises:
-            KeyError: it was another time.
-        """
+        """The frame for the time last returned by ``next_transmission_ticks``. Raises KeyError: it was another time."""
         superframe, slot = self._pending.pop(tx_ticks)
         unwrapped = self._own_ticks.expect(tx_ticks)
         self._take_over_if_due(unwrapped - self._lead_ticks)

@@ -99,7 +99,6 @@ _JUDGED_TURN_MPS2: Final = 10.0
 _PHASE_WARMUP_S: Final = 2.5
 _PHASE_RATIO: Final = 1.05
 """Largest ratio of the RMSE with phases to that by stamps alone."""
-_HANDS_QA_M2PS3: Final = 3.0
 _LOCKS: Final = (*product(("walking", "hands"), (400.0, 100.0), (1e-9, 5e-9)), ("hands", 60.0, 5e-9))
 """Motion, beacons of all anchors a second, random-walk FM of the crystals in 1/√s; plain ones have 5·10⁻⁹."""
 
@@ -368,8 +367,7 @@ def _phases(plan: Plan) -> list[Case]:
     """Scenes without and with phases of the carrier: the same stamps, then the phases of the tag's own receptions."""
     exceeded = _exceeded(1e-3)
     honest = (Limit("nees", most=1.5), exceeded)
-    in_site, usual = lab_site(plan.noise_ps), CarrierModel()
-    quiet = replace(usual, reflections=RangeErrorModel())
+    in_site, usual, quiet = lab_site(plan.noise_ps), CarrierModel(), CarrierModel(reflections=RangeErrorModel())
     stronger = replace(usual, reflections=RangeErrorModel(changing_m=0.008, correlation_m=0.05))
     wander = partial(wanderers, in_site, plan.tags)
     in_room = partial(worlds, plan, in_site, wander, room=Room())
@@ -408,7 +406,7 @@ def _locking(plan: Plan, motion: str, rate_hz: float, random_walk_fm: float, **o
 
 def _hand_paths(site: Site, tags: int, seed: int) -> list[Trajectory]:
     low_m, high_m = box(site)
-    return [wanderer(low_m, high_m, seed, tag, _HANDS_QA_M2PS3) for tag in range(tags)]
+    return [wanderer(low_m, high_m, seed, tag, qa_m2ps3=3.0) for tag in range(tags)]
 
 
 CONDITIONS: Final[dict[str, Callable[[Plan], list[Case]]]] = {
