@@ -80,9 +80,10 @@ def motion_noise(s: State) -> float:
 
 
 def has_phase(s: State, anchor: int) -> bool:
-    """Whether an anchor's phases are in use: its ambiguity is confirmed, and phases are not being rejected."""
-    own = s.anchors[anchor].own
-    return own.is_known and own.refused_in_row < int(s.tuning.phases_in_row) - 1
+    """Whether an anchor's phases are in use: its ambiguity is confirmed, and phases still come and are not rejected."""
+    own, tuning = s.anchors[anchor].own, s.tuning
+    is_recent = (s.status.epoch_ticks - own.ticks) * TICK_S < 2.0 * tuning.rate_s
+    return own.is_known and is_recent and own.refused_in_row < int(tuning.phases_in_row) - 1
 
 
 def follows_cycles(s: State) -> bool:

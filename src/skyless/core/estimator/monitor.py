@@ -258,7 +258,7 @@ def adapt_clock_noise(s: State, anchor: int, normalised: float) -> None:
 
 def _least_scale(s: State, walk: float) -> float:
     """Factor on the settings' random walk of a clock below which it is not adapted, by what its rates have shown."""
-    if PHASE_STATES > 0 and s.status.rate_changes > 1:
+    if PHASE_STATES > 0 and s.status.rate_changes > 1 and s.settings.walk > 0.0:
         return min(max(walk / s.settings.walk, s.tuning.least_walk_scale), s.tuning.max_walk_scale)
     return 1.0
 

@@ -163,11 +163,10 @@ def _limit_m2(s: State, variance: float) -> float:
 
 def _count_wild(s: State, variance: float) -> None:
     """Update the share of wild phases by how likely the newest is one: all phases are then equally likely."""
-    status, tuning = s.status, s.tuning
-    share = max(status.wild_share, tuning.least_wild)
+    status, share = s.status, max(s.status.wild_share, s.tuning.least_wild)
     wild = share * sqrt(_TWO_PI * variance) / _wavelength_m(s)
     is_wild = wild / (wild + (1.0 - share) * s.hypotheses.fit)
-    status.wild_share += tuning.slow_forgetting * (is_wild - status.wild_share)
+    status.wild_share += s.tuning.slow_forgetting * (is_wild - status.wild_share)
 
 
 def _learn_noise(s: State, shown_m2: float) -> None:

@@ -2180,10 +2180,12 @@ INTERNAL real motion_noise(State *s) {
     return s->settings.qa * max_real(status->q_scale, least);
 }
 
-/* Whether an anchor's phases are in use: its ambiguity is confirmed, and phases are not being rejected. */
+/* Whether an anchor's phases are in use: its ambiguity is confirmed, and phases still come and are not rejected. */
 INTERNAL bool has_phase(State *s, int32_t anchor) {
     Ambiguity *own = &s->anchors[anchor].own;
-    return own->is_known && own->refused_in_row < truncated(s->tuning.phases_in_row) - 1;
+    Tuning *tuning = &s->tuning;
+    bool is_recent = (real)(s->status.epoch_ticks - own->ticks) * TICK_S < REAL(2.0) * tuning->rate_s;
+    return own->is_known && is_recent && own->refused_in_row < truncated(tuning->phases_in_row) - 1;
 }
 
 /* Whether phases of enough anchors are in use to determine the tag's clock. */
@@ -3443,7 +3445,7 @@ INTERNAL void adapt_clock_noise(State *s, int32_t anchor, real normalised) {
 
 /* Factor on the settings' random walk of a clock below which it is not adapted, by what its rates have shown. */
 INTERNAL real least_scale(State *s, real walk) {
-    if (PHASE_STATES > 0 && s->status.rate_changes > 1) {
+    if (PHASE_STATES > 0 && s->status.rate_changes > 1 && s->settings.walk > REAL(0.0)) {
         return min_real(max_real(walk / s->settings.walk, s->tuning.least_walk_scale), s->tuning.max_walk_scale);
     }
     return REAL(1.0);
@@ -5151,11 +5153,10 @@ INTERNAL real limit_m2(State *s, real variance) {
 /* Update the share of wild phases by how likely the newest is one: all phases are then equally likely. */
 INTERNAL void count_wild(State *s, real variance) {
     Status *status = &s->status;
-    Tuning *tuning = &s->tuning;
-    real share = max_real(status->wild_share, tuning->least_wild);
+    real share = max_real(s->status.wild_share, s->tuning.least_wild);
     real wild = share * SQRT(TWO_PI * variance) / wavelength_m(s);
     real is_wild = wild / (wild + (REAL(1.0) - share) * s->hypotheses.fit);
-    status->wild_share += tuning->slow_forgetting * (is_wild - status->wild_share);
+    status->wild_share += s->tuning.slow_forgetting * (is_wild - status->wild_share);
 }
 
 /* Adapt the variance of phases to innovations beyond their prediction: reflections differ in size. */
