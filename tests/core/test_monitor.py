@@ -132,7 +132,7 @@ def test_innovations_of_all_anchors_but_one_small_one_are_on_one_side(newest, is
         s.anchors[anchor].innovation = innovation
     assert monitor.is_common(s, 3.0) is is_common
     assert monitor.is_common(s, -3.0) is (newest[0] < 0.0)
-    assert not monitor.is_common(s, 1.5)
+    assert monitor.is_common(s, 1.5) is False
 
 
 def test_two_anchors_show_no_common_cause_in_the_plane():
@@ -186,6 +186,31 @@ def test_the_noise_of_motion_grows_while_innovations_along_the_axes_stay_on_one_
     assert [s.status.lag[0], s.status.lag[1], s.status.lag[2]] == [near(lag[0]), near(lag[1]), 0.0]
     assert s.status.lag_square == near(TUNING.lag_limit * factor)
     assert s.status.q_scale == near(10.0 * (TUNING.noise_growth if is_beyond else TUNING.noise_loss))
+    s.status.lag[0] = s.status.lag[1] = s.status.lag_square = 0.0
+    s.status.q_scale = 1.0
+    monitor.adapt_process_noise(s, 0.0)
+    assert s.status.q_scale == 1.0
+
+
+@pytest.mark.parametrize(
+    ("changes", "stated", "shown", "least"),
+    [
+        (1, 2.0, 0.5, 1.0),
+        (2, 2.0, 0.5, 0.25),
+        (2, 2.0, 1e-9, 0.02),
+        (2, 2.0, 1e9, 1e4),
+        (2, 0.5, 0.25, 0.5),
+        (2, 0.0, 1.0, 1.0),
+    ],
+)
+def test_the_noise_of_clocks_returns_to_what_their_rates_have_shown(changes, stated, shown, least):
+    s = state()
+    s.settings.walk, s.status.rate_changes = stated, changes
+    s.status.anchors_walk, s.status.tag_walk = shown, 0.0
+    s.anchors[1].walk_scale = s.status.walk_scale = 1e-3
+    monitor.adapt_clock_noise(s, 1, 0.0)
+    monitor.adapt_process_noise(s, 0.0)
+    assert (s.anchors[1].walk_scale, s.status.walk_scale) == (near(least), near(least))
 
 
 @beyond

@@ -328,7 +328,7 @@ def _note_update(s: State, innovation: float, innovation_variance: float, gain_s
     if PHASE_STATES > 0:
         for one in range(s.hypotheses.count):
             off = innovation * inverse + g[FAULT_KINDS * s.count + one]
-            s.hypotheses.log_weight[one] -= 0.5 * off * off
+            s.hypotheses.log_weight[one] -= min(0.5 * off * off, 1e6)  # infinite in single precision
     step *= innovation
     for state in range(s.used):
         s.x[state] += u[state] * step

@@ -64,7 +64,7 @@ def own_phase(s: State, anchor: int, phase_cycles: float) -> None:
     expected_m = _phase_terms(s, anchor)
     cycles = -phase_cycles - _whole_cycles(s, a.offset_ticks)
     innovation, variance = _innovation_m(s, cycles, expected_m), status.phase_variance_m2
-    predicted = compute_ph(s)
+    predicted = max(compute_ph(s), 0.0)  # below zero by rounding in single precision
     is_telling = a.own.is_known and square(s.settings.gate) * (predicted + variance) < square(_wavelength_m(s))
     is_used = _use_phase(s, ambiguity, a.own, innovation, predicted, variance, True)
     if is_telling:
@@ -94,7 +94,7 @@ def relay_phase(s: State, listener: int, sender: int, packet_rx_ticks: Ticks, ph
     variance = square(s.tuning.phase_mesh_std_m) + relay_variance(s, listener, sender, age_s) - settings.rx_variance_m2
     innovation = _innovation_m(s, cycles, expected_m + s.x[where.mesh + listener])
     is_slow = s.status.recent_square < 4.0 * square(s.tuning.phase_walking_mps)  # a fast tag's own need all hypotheses
-    _use_phase(s, where.mesh + listener, i.mesh, innovation, compute_ph(s), variance, is_slow)
+    _use_phase(s, where.mesh + listener, i.mesh, innovation, max(compute_ph(s), 0.0), variance, is_slow)
 
 
 def _whole_cycles(s: State, ticks: Ticks) -> float:

@@ -2500,7 +2500,7 @@ INTERNAL void note_update(State *s, real innovation, real innovation_variance, r
     if (PHASE_STATES > 0) {
         for (int32_t one = 0, one_end = s->hypotheses.count; one < one_end; one++) {
             real off = innovation * inverse + g[FAULT_KINDS * s->count + one];
-            s->hypotheses.log_weight[one] -= REAL(0.5) * off * off;
+            s->hypotheses.log_weight[one] -= min_real(REAL(0.5) * off * off, REAL(1000000.0));  /* infinite in single precision */
         }
     }
     step *= innovation;
@@ -5040,7 +5040,7 @@ INTERNAL void own_phase(State *s, int32_t anchor, real phase_cycles) {
     real cycles = -phase_cycles - whole_cycles(s, a->offset_ticks);
     real innovation = innovation_m(s, cycles, expected_m);
     real variance = status->phase_variance_m2;
-    real predicted = compute_ph(s);
+    real predicted = max_real(compute_ph(s), REAL(0.0));  /* below zero by rounding in single precision */
     bool is_telling = a->own.is_known && square(s->settings.gate) * (predicted + variance) < square(wavelength_m(s));
     bool is_used = use_phase(s, ambiguity, &a->own, innovation, predicted, variance, true);
     if (is_telling) {
@@ -5077,7 +5077,7 @@ INTERNAL void relay_phase(State *s, int32_t listener, int32_t sender, int64_t pa
             settings->rx_variance_m2;
     real innovation = innovation_m(s, cycles, expected_m + s->x[where->mesh + listener]);
     bool is_slow = s->status.recent_square < REAL(4.0) * square(s->tuning.phase_walking_mps);  /* a fast tag's own need all hypotheses */
-    use_phase(s, where->mesh + listener, &i->mesh, innovation, compute_ph(s), variance, is_slow);
+    use_phase(s, where->mesh + listener, &i->mesh, innovation, max_real(compute_ph(s), REAL(0.0)), variance, is_slow);
 }
 
 /* Fractional cycles, in [0, 1), of a number of ticks. */
