@@ -69,7 +69,7 @@ def measure(s, h):
     return compute_ph(s)
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=15, deadline=None)
 @given(seed=st.integers(0, 10**6), kinds=st.lists(st.booleans(), min_size=1, max_size=8))
 def test_hypotheses_are_a_mixture_of_filters_with_one_covariance(seed, kinds):
     draw = np.random.default_rng(seed)

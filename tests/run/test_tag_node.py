@@ -71,7 +71,7 @@ def test_no_more_fixes_are_published_than_asked_for_on_average_nor_in_any_second
 
 
 def test_a_tag_s_state_names_the_anchors_whose_phases_it_uses():
-    told = []
+    found = []
     for heard in (HEARD, receptions(6.0, carrier=True)):
         bench = Bench()
         bench.hear(heard)
@@ -80,8 +80,8 @@ def test_a_tag_s_state_names_the_anchors_whose_phases_it_uses():
             method="joint", reason=None, counters=Counter(), mqtt=Counters(0, 0, 0), **numbers
         )
         state = bench.node.complete(counted)
-        told.append((state.carrier_phase_anchors, state.carrier_phase_hypotheses > 0))
-    assert told == [((), False), (tuple(sorted(anchor.id for anchor in LAB.anchors)), True)]
+        found.append((state.carrier_phase_anchors, state.carrier_phase_hypotheses > 0))
+    assert found == [((), False), (tuple(sorted(anchor.id for anchor in LAB.anchors)), True)]
 
 
 def test_pauses_are_not_made_up_for_by_a_burst():

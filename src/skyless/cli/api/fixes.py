@@ -180,7 +180,7 @@ class FixRecorder:
 
     def fixes(self) -> Fixes:
         """All fixes so far."""
-        rows = np.array(self._numbers).reshape(-1, 26)
+        rows = np.array(self._numbers).reshape(-1, 26)  # as many as ``add`` keeps of each fix
         rows.setflags(write=False)
         return Fixes(
             tags=self._tags,
@@ -274,7 +274,7 @@ class MeasurementRecorder:
 
     def measurements(self) -> Measurements:
         """All measurements so far."""
-        whole = np.array(self._whole, dtype=np.int64).reshape(-1, 7)
+        whole = np.array(self._whole, dtype=np.int64).reshape(-1, 7)  # as many as ``add`` keeps of each
         numbers = np.array(self._numbers).reshape(-1, 2)
         for rows in (whole, numbers):
             rows.setflags(write=False)

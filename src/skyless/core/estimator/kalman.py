@@ -96,7 +96,7 @@ def follows_cycles(s: State) -> bool:
 
 
 def are_phases_reliable(s: State) -> bool:
-    """Whether phases are in use, are rarely wild, and range errors have not jumped of late: cycles may be uncertain."""
+    """Whether phases may be taken at several cycles: they are rarely wild, and no range error has jumped recently."""
     has_phases = PHASE_STATES > 0 and s.status.has_phases
     return has_phases and s.status.wild_share < s.tuning.most_wild and jump_share(s) < 1.0
 
@@ -328,7 +328,7 @@ def _note_update(s: State, innovation: float, innovation_variance: float, gain_s
     if PHASE_STATES > 0:
         for one in range(s.hypotheses.count):
             off = innovation * inverse + g[FAULT_KINDS * s.count + one]
-            s.hypotheses.log_weight[one] -= min(0.5 * off * off, 1e6)  # infinite in single precision
+            s.hypotheses.log_weight[one] -= min(0.5 * off * off, 1e6)  # a square may overflow
     step *= innovation
     for state in range(s.used):
         s.x[state] += u[state] * step

@@ -64,10 +64,10 @@ def own_phase(s: State, anchor: int, phase_cycles: float) -> None:
     expected_m = _phase_terms(s, anchor)
     cycles = -phase_cycles - _whole_cycles(s, a.offset_ticks)
     innovation, variance = _innovation_m(s, cycles, expected_m), status.phase_variance_m2
-    predicted = max(compute_ph(s), 0.0)  # below zero by rounding in single precision
-    is_telling = a.own.is_known and square(s.settings.gate) * (predicted + variance) < square(_wavelength_m(s))
+    predicted = max(compute_ph(s), 0.0)  # rounding may make it negative
+    is_informative = a.own.is_known and square(s.settings.gate) * (predicted + variance) < square(_wavelength_m(s))
     is_used = _use_phase(s, ambiguity, a.own, innovation, predicted, variance, True)
-    if is_telling:
+    if is_informative:
         _count_wild(s, predicted + variance)
     if is_used and predicted <= _certain_m2(s) and s.hypotheses.count == 0:
         _learn_noise(s, square(innovation) - predicted)

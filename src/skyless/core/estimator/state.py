@@ -367,7 +367,7 @@ class Status(Record):
     tag_walk: float
     """The same of the tag's."""
     recent_square: float
-    """Square of the largest speed of late, with a memory of ``speed_memory_s``, while phases are in use."""
+    """Square of the largest recent speed, with a memory of ``speed_memory_s``, while phases are in use."""
     line_m: Annotated[Reals, AXES]
     """Point at which phases are linearised: a position of the tag, moved from then on by its velocity alone."""
     step_m: Annotated[Reals, AXES]

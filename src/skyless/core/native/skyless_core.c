@@ -2199,7 +2199,7 @@ INTERNAL bool follows_cycles(State *s) {
     return PHASE_STATES > 0 && found > s->dim;
 }
 
-/* Whether phases are in use, are rarely wild, and range errors have not jumped of late: cycles may be uncertain. */
+/* Whether phases may be taken at several cycles: they are rarely wild, and no range error has jumped recently. */
 INTERNAL bool are_phases_reliable(State *s) {
     bool has_phases = PHASE_STATES > 0 && s->status.has_phases;
     return has_phases && s->status.wild_share < s->tuning.most_wild && jump_share(s) < REAL(1.0);
@@ -2500,7 +2500,7 @@ INTERNAL void note_update(State *s, real innovation, real innovation_variance, r
     if (PHASE_STATES > 0) {
         for (int32_t one = 0, one_end = s->hypotheses.count; one < one_end; one++) {
             real off = innovation * inverse + g[FAULT_KINDS * s->count + one];
-            s->hypotheses.log_weight[one] -= min_real(REAL(0.5) * off * off, REAL(1000000.0));  /* infinite in single precision */
+            s->hypotheses.log_weight[one] -= min_real(REAL(0.5) * off * off, REAL(1000000.0));  /* a square may overflow */
         }
     }
     step *= innovation;
@@ -5040,10 +5040,11 @@ INTERNAL void own_phase(State *s, int32_t anchor, real phase_cycles) {
     real cycles = -phase_cycles - whole_cycles(s, a->offset_ticks);
     real innovation = innovation_m(s, cycles, expected_m);
     real variance = status->phase_variance_m2;
-    real predicted = max_real(compute_ph(s), REAL(0.0));  /* below zero by rounding in single precision */
-    bool is_telling = a->own.is_known && square(s->settings.gate) * (predicted + variance) < square(wavelength_m(s));
+    real predicted = max_real(compute_ph(s), REAL(0.0));  /* rounding may make it negative */
+    bool is_informative = a->own.is_known && square(s->settings.gate) * (predicted + variance) <
+            square(wavelength_m(s));
     bool is_used = use_phase(s, ambiguity, &a->own, innovation, predicted, variance, true);
-    if (is_telling) {
+    if (is_informative) {
         count_wild(s, predicted + variance);
     }
     if (is_used && predicted <= certain_m2(s) && s->hypotheses.count == 0) {

@@ -1048,7 +1048,7 @@ typedef struct Status {
     int64_t rate_changes;
     real anchors_walk;  /* Random walk of the anchors' clocks by changes of their rates [m²/s³]. */
     real tag_walk;  /* The same of the tag's. */
-    /* Square of the largest speed of late, with a memory of ``speed_memory_s``, while phases are in use. */
+    /* Square of the largest recent speed, with a memory of ``speed_memory_s``, while phases are in use. */
     real recent_square;
     /* Point at which phases are linearised: a position of the tag, moved from then on by its velocity alone. */
     real line_m[3];
