@@ -108,6 +108,7 @@ uint32_t selftest_turn(struct board *board, uint32_t now_us)
     }
     link_send(writer);
     board->tests_left--;
+    board->understood_us = now_us; /* the host may only listen meanwhile */
     board->test_due_us += (board->test_bytes * BYTE_US_TIMES_BAUD) / board->settings.baud;
     return 0u;
 }

@@ -11,7 +11,7 @@ import pytest
 from live_nodes import LiveSite
 
 from skyless.cli.main import main
-from skyless.cli.nodes.doctor import _report
+from skyless.cli.nodes.doctor import report_text
 from skyless.core.site import NoiseSite
 from skyless.core.ticks import TICK_RATE_HZ
 from skyless.radio.serial.serial_port import Pty
@@ -129,7 +129,7 @@ def test_the_clock_is_as_the_system_says(state, result, monkeypatch):
 
 @pytest.mark.site
 def test_a_report_has_what_failed_first_and_nothing_that_controls_a_terminal():
-    text = _report([Check("a", "ok", "fine."), Check("b", "failed", "x\n\x1b[2Jy.", "do it")])
+    text = report_text("t", "", [Check("a", "ok", "fine."), Check("b", "failed", "x\n\x1b[2Jy.", "do it")])
     assert text.splitlines()[5:] == ["- failed: b: x��[2Jy.", "  do it", "- ok: a: fine."]
     assert "1 failed, 0 warning, 0 not checked, 1 ok" in text
 

@@ -26,13 +26,15 @@ _TURN_S: Final = 5e-6
 class HostBoard(Processor):
     """One board; its program is run again after the supply failed."""
 
+    reset_cause = 0
+
     def __init__(self, seat: Seat) -> None:
         self._seat, self._timeline, self.chip = seat, seat.timeline, seat.chip
         self._start()
 
     def program(self) -> None:
         """Run the board's loop, as the image's ``main`` does."""
-        board = CBoard(self, can_transmit=self._seat.can_transmit, device_id=self._seat.identity)
+        board = CBoard(self, can_transmit=self._seat.can_transmit, device_id=self._seat.identity, reset_cause=self.reset_cause)
         board.begin()
         while True:
             wait_us = board.turn()

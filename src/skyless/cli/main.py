@@ -35,6 +35,7 @@ _GROUPS: Final = {
         ("survey", "survey", "Find where anchors hang, and their antenna delays."),
         ("calibrate", "survey:calibrate_app", "Correct antenna delays by a tag at known positions."),
         ("flash-config", "nodes.boards:flash_app", "Set up a board that computes its own position."),
+        ("selftest", "nodes.selftest", "Test one or two boards in two minutes, before there is a site."),
         ("doctor", "nodes.doctor", "Check a computer, its boards and a running site in two minutes."),
     ),
     "Run a site": (

@@ -1,5 +1,6 @@
 """``skyless board``: an emulated board, one node of the emulated air behind a pseudo-terminal."""
 
+import asyncio
 import json
 import math
 import struct
@@ -38,6 +39,7 @@ from skyless.radio.tag_reports import BODY_AT, fix_body, georeference_body, plac
 from skyless.run.fix_log import Lateness
 from skyless.run.open_radio import RadioMonitor
 from skyless.run.process import HEALTH_S, Log, RateLimit, every, together
+from skyless.sim.dw1000.chip import Sensors
 
 # A board that is a tag by itself. Like the firmware (``firmware/source/tag.c``), it computes with ``Receiver``, but it
 # uses this computer's clock, and neither sleeps nor advertises.
@@ -158,9 +160,11 @@ class LinkProtocol(BoardProtocol):
     def __init__(
         self, radio: Radio, send: Send, *, can_transmit: bool, clock_s: Callable[[], float] = time.monotonic
     ) -> None:
-        """A board that only listens can also be a tag by itself; ``clock_s()`` is its host's time."""
+        """``clock_s()`` is its host's time."""
         self._radio, self._send, self._can_transmit = radio, send, can_transmit
-        self.tag = None if can_transmit else BoardTag(self.report, clock_s)
+        self._clock_s = clock_s
+        self.tag = BoardTag(self.report, clock_s)
+        self._tested = 0
         self._reader, self._writer = link.Reader(), link.Writer()
         self._configured = self._receiving = self._wants_phases = False
         self._tx_delay_ticks = 0
@@ -183,12 +187,11 @@ class LinkProtocol(BoardProtocol):
             self._configured = self._receiving = False
             self._waiting.clear()
             self._send(b"\0")
-            if self.tag is not None:
-                self.tag.begin(self.tag.flash)
+            self.tag.begin(self.tag.flash)
             self._hello()
 
     def _hear(self, reception: Reception) -> None:
-        if self.tag is not None and self.tag.is_on:
+        if self.tag.is_on:
             self.tag.hear(reception)
             return
         if not self._receiving:
@@ -220,14 +223,19 @@ class LinkProtocol(BoardProtocol):
             self._transmit(int.from_bytes(record[BODY_AT : link.TX_FRAME_AT], "little"), record[link.TX_FRAME_AT :])
         elif kind in (link.RX_ON, link.TX_AT):
             self.report(link.REFUSED, bytes((kind, link.REFUSED_MALFORMED)))
-        elif kind in (link.SET_TAG_CONFIG, link.ASK_TAG_CONFIG, link.SET_TIME) and self.tag is not None:
+        elif kind in (link.SET_TAG_CONFIG, link.ASK_TAG_CONFIG, link.SET_TIME):
             self.tag.execute(record)
+        elif kind == link.READ and len(record) >= link.READ_DATA_AT:
+            self._read(record)
+        elif kind == link.TEST_LINE and len(record) >= BODY_AT + 3:
+            self._tested += 1
+            self._send_tests(int.from_bytes(record[2:4], "little"), record[4])
         else:
             self.counts["garbled"] += 1
 
     def _hello(self) -> None:
         name = self._radio.name.encode()[:8].ljust(8, b"\0")
-        abilities = link.HAS_PHASES | (link.CAN_TRANSMIT if self.tag is None else link.CAN_COMPUTE)
+        abilities = link.HAS_PHASES | link.CAN_COMPUTE | (link.CAN_TRANSMIT if self._can_transmit else 0)
         self._write(self._writer.hello(_EMULATED_FIRMWARE, name, abilities))
 
     def _status(self) -> None:
@@ -246,9 +254,29 @@ class LinkProtocol(BoardProtocol):
         self._tx_delay_ticks = int.from_bytes(record[8:10], "little")
         self._wants_phases = bool(record[link.CONFIG_BYTES - 1] & link.WANTS_PHASES)
         self._configured, self._receiving = True, False
-        if self.tag is not None:
-            self.tag.settings = replace(self.tag.settings, mode=MODES.index("radio"))
+        self.tag.settings = replace(self.tag.settings, mode=MODES.index("radio"))
         self._status()
+
+    def _send_tests(self, count: int, line_bytes: int) -> None:
+        """Send as many records as are asked for, as fast as the line would carry them."""
+        if count:
+            self.report(link.TEST, bytes(range(max(line_bytes - link.TEST_OVERHEAD, 0))))
+            pause_s = 10 * line_bytes / self.tag.settings.baud
+            asyncio.get_running_loop().call_later(pause_s, self._send_tests, count - 1, line_bytes)
+
+    def _read(self, record: bytes) -> None:
+        """Answer READ as a sound board would: there is no chip here."""
+        file, sub, octets = record[2], int.from_bytes(record[3:5], "little"), record[5]
+        now_s, ticks = self._clock_s(), self._radio.now_ticks() or 0
+        us, periods = round(1e6 * now_s) & 0xFFFF_FFFF, round(32_768 * now_s) & 0xFF_FFFF
+        found = {
+            0x00: link.DEVICE_ID.to_bytes(4, "little"),
+            link.OTP: Sensors().otp().get(sub, 0).to_bytes(4, "little"),
+            link.FACTS: struct.pack("<7I", 0x52832, 0, 5 << 4, 21, 0x5A, 12_288, 6_000),
+            link.CLOCKS: struct.pack("<2I", us, periods) + ticks.to_bytes(5, "little"),
+            link.COUNTS: struct.pack("<5I", 100, 0, 0, 275, self._tested),
+        }.get(file, record[link.READ_DATA_AT :] or bytes(octets))
+        self.report(link.VALUE, record[2:5] + bytes(2) + found)
 
     def _transmit(self, dx_ticks: int, frame: bytes) -> None:
         if not (self._configured and self._can_transmit):
@@ -506,8 +534,8 @@ class Board:
         """Serve until cancelled."""
         self.pty.start(self.protocol.on_host_data)
         try:
-            tag = self.protocol.tag if isinstance(self.protocol, LinkProtocol) else None
-            seconds = () if tag is None else (every(HEALTH_S, tag.each_second),)
+            protocol = self.protocol
+            seconds = (every(HEALTH_S, protocol.tag.each_second),) if isinstance(protocol, LinkProtocol) else ()
             await together(self.radio.run(self._on_event), *seconds)
         finally:
             self.pty.close()

@@ -102,7 +102,9 @@ def doctor(*, asked: DoctorOptions, live: SiteOptions, output: JsonOptions) -> i
     if not checks:
         return 1
     failed = sum(one.result == "failed" for one in checks)
-    text = _report(checks)
+    title = f"skyless doctor {installed_version()}, {platform.node()}, {time.strftime('%Y-%m-%d %H:%M')}"
+    about = f"Python {platform.python_version()} on {platform.platform()}. {EMULATED}"
+    text = report_text(title, about, checks)
     if report is not None:
         write_file(report, text.encode())
     if output.json:
@@ -176,15 +178,17 @@ async def _examine(
     return checks if site is None else [*checks, *site.checks(file_site)]
 
 
-def _report(checks: Sequence[Check]) -> str:
-    """The report as Markdown, failed checks first."""
+EMULATED: Final = "Simulated radios and emulated boards are checked as if they were real ones."
+
+
+def report_text(title: str, about: str, checks: Sequence[Check]) -> str:
+    """A report as Markdown, failed checks first."""
     order = get_args(Result)
     counts = Counter(check.result for check in checks)
     lines = [
-        f"# skyless doctor {installed_version()}, {platform.node()}, {time.strftime('%Y-%m-%d %H:%M')}",
+        f"# {title}",
         "",
-        f"Python {platform.python_version()} on {platform.platform()}. "
-        "Simulated radios and emulated boards are checked as if they were real ones.",
+        about,
         f"{', '.join(f'{counts[result]} {result}' for result in order)}.",
         "",
     ]

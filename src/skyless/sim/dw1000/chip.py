@@ -78,7 +78,7 @@ class Clocking:
     """Preconditions of sending and receiving. ``seconds`` is any monotonic clock."""
 
     def __init__(self, memory: Memory, misuse: Counter[str], seconds: Callable[[], float], sensors: Sensors) -> None:
-        self._memory, self._misuse, self._seconds, self._sensors = memory, misuse, seconds, sensors
+        self._memory, self._misuse, self._seconds, self.sensors = memory, misuse, seconds, sensors
         self._lock_s = seconds() + _LOCK_S
         self._loaded_s: float | None = None
         self.in_reset = False
@@ -125,7 +125,7 @@ class Clocking:
         """Apply OTP_CTRL: read a word, or load the microcode (UM 6.3.2, 2.5.5.10)."""
         control = self._memory.get(r.OTP_CTRL)
         if control & r.OTPREAD:
-            self._memory.set(r.OTP_RDAT, self._sensors.otp().get(self._memory.get(r.OTP_ADDR) & 0x7FF, 0))
+            self._memory.set(r.OTP_RDAT, self.sensors.otp().get(self._memory.get(r.OTP_ADDR) & 0x7FF, 0))
         if control & r.LDELOAD:
             if self._memory.get(r.PMSC_CTRL0) & 0xFFFF == r.PMSC_FOR_LDE:
                 self._loaded_s = self._seconds() + _LOAD_S
@@ -138,7 +138,7 @@ class Clocking:
         memory = self._memory
         ready = memory.get(r.RF_SENSOR_1) == 0x80 and memory.get(r.RF_SENSOR_2) == 0x0F
         if memory.get(r.TC_SARC) & 1 and ready:
-            volts, kelvins = self._sensors.readings()
+            volts, kelvins = self.sensors.readings()
             memory.set(r.TC_SARL, volts | kelvins << 8)
 
 

@@ -1,0 +1,82 @@
+"""The self-test of boards: each fault that is planted is named by its sentence and no other, and sound boards pass."""
+
+import dataclasses
+import json
+import re
+
+import msgspec
+import pytest
+from firmware_stage import needs_compiler, needs_processor
+from hypothesis import given
+from hypothesis import strategies as st
+from selftest_stage import DISTANCE_M, FACTS, FEW, Fault, Pair, sentences
+
+from skyless.run.selftest.facts import Report, judge
+from skyless.sim.dw1000.chip import Sensors
+
+pytestmark = [pytest.mark.site, needs_compiler]
+
+
+def facts(**other):
+    return tuple(other.get(f"fact{at}", fact) for at, fact in enumerate(FACTS))
+
+
+ALONE = {
+    "line": (Fault(carries=460_800, baud=1_000_000), r"This port carries 460,800 baud, not 1,000,000\."),
+    "every rate": (Fault(carries=0), r"This port spoils records at every rate, [\d.]+ % at 460,800 baud\."),
+    "part": (Fault(facts=facts(fact0=0x52840)), r"This processor is a 52840, not an nRF52832\."),
+    "revision": (Fault(facts=facts(fact2=0x80)), r"Unknown revision 8: please report\."),
+    "UICR": (Fault(facts=facts(fact2=0x70, fact4=0xFFFFFFFF)), r"The flashing has left out UICR: .*"),
+    "stack": (Fault(facts=facts(fact6=10_500)), r"The stack was used to 85 %\."),
+    "watchdog": (Fault(cause=2), r"It was last restarted by its watchdog\."),
+    "no slow crystal": (Fault(slow_hz=0.0), r"The slow crystal does not run; sleeping tags will be off\."),
+    "RC instead of it": (Fault(slow_hz=33_400.0), r"The slow crystal does not run; sleeping tags will be off\."),
+    "no chip": (Fault(chip="absent"), r"Read FFFFFFFF 40 times: the chip has no supply or is not selected\."),
+    "SPI": (Fault(chip="spi"), r"(\d+ of 40 readings of (DECA0130|A55A00FF) at 8 MHz differ|.* not at 8: the SPI is disturbed)\."),
+    "no lock": (Fault(chip="no lock"), r"The DW1000 answers, but its clock does not lock: supply\."),
+    "trim": (Fault(sensors=Sensors(crystal_trim=0)), r"The crystal was never trimmed: offsets up to 20 ppm\."),
+    "untested": (Fault(sensors=Sensors(part=0)), r"The chip's memory holds no part number: it was never tested\."),
+    "counter": (Fault(processor_ppm=105.0), r"The DW1000's crystal and the processor's differ by -\d+ ppm\."),
+    "hot": (Fault(sensors=Sensors(temperature_c=72.0)), r"The chip is at (6[6-9]|7\d) °C\."),
+    "supply": (Fault(sensors=Sensors(supply_v=2.75)), r"The supply is 2\.[6-8]\d V, not 3\.3\."),
+    "stamp": (Fault(chip="stamp"), r"Frame \d+ left 512 ticks late( \(\d+ frames left at another time\))?\."),
+}
+"""By what is wrong with one board; its sentence."""
+
+TOGETHER = {
+    "slips": (Fault(chip="slips"), r"The clock slips \(\d+ times, the carrier's 0\): supply\."),
+    "cycles": (Fault(transfer_s=30e-6), r"The table of cycles is wrong by [3-6]\d %: please report\."),
+    "lost": (Fault(lost=0.2), r"B loses [12]\d % of A's frames\."),
+    "deaf": (Fault(lost=1.0), r"B does not hear A\."),
+    "antenna": (Fault(weaker_db=8.0), r"B hears A 8 dB weaker than A hears B: antenna covered\?"),
+    "carriers": (Fault(offset_bias_ppm=3.0), r"The boards state offsets of .* ppm, not opposite ones\."),
+    "far crystals": (Fault(crystals_ppm=14.0), r"The crystals differ by 28 ppm\."),
+    "jitter": (Fault(stamp_ps=320.0), r"Stamps jitter by [3-6]\d\d ps: first path not found, metal near\?"),
+    "delays": (Fault(delay_ticks=470), r"Delays off by 4\.\d m: calibrate\."),
+}
+"""The same of what two boards show."""
+
+CASES = [
+    pytest.param(fault, boards, sentence, id=name)
+    for table, boards in ((ALONE, 1), (TOGETHER, 2))
+    for name, (fault, sentence) in table.items()
+]
+SEEDS = [1, *(pytest.param(seed, marks=pytest.mark.statistical) for seed in range(2, 21))]
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize(("fault", "boards", "sentence"), CASES)
+def test_each_fault_is_named_by_its_sentence_and_no_other(fault, boards, sentence, seed):
+    found = sentences(Pair(fault, seed, boards).test())
+    assert len(found) == 1, found
+    assert re.fullmatch(sentence, found[0]), found
+
+
+@pytest.mark.parametrize("seed", [1, *(pytest.param(seed, marks=pytest.mark.statistical) for seed in range(2, 51))])
+def test_sound_boards_pass(seed):
+    pair = Pair(seed=seed)
+    report = pair.test()
+    assert sentences(report) == []
+    assert [node.chip.misuse for node in pair.nodes] == [{}, {}]
+    assert {check.result for check in judge(report)} == {"ok"}
+    assert len(judge(report)) == 28
