@@ -1,4 +1,4 @@
-"""Build hook: make the library of the estimator, for this machine or the one that a wheel is for.
+"""Build hook: make the library of the estimator, for this machine or a wheel's, and take the firmware along.
 
 ``CC`` names the C compiler and ``SKYLESS_TARGET`` the other machine; ``tools/compile_core.py`` says more.
 """
@@ -32,3 +32,6 @@ class CoreBuildHook(BuildHookInterface):  # type: ignore[type-arg]
         build_data["tag"] = f"py3-none-{platform}"
         libraries = build(Path(self.root) / NATIVE)
         build_data["artifacts"] += [f"/{library.relative_to(self.root)}" for library in libraries]
+        image = Path(self.root) / "firmware" / "build" / "skyless-dwm1001.hex"
+        if version == "standard" and image.is_file():  # an editable installation takes it where it is built
+            build_data["force_include"][str(image)] = "skyless/radio/serial/skyless-dwm1001.hex"

@@ -78,16 +78,21 @@ void reset_handler(void)
     (void)main();
 }
 
-/* The system exceptions of the Armv7-M; interrupts are never taken. */
+#define IMAGE_NAME "skyless-dwm1001 " SKYLESS_VERSION
+
+/* The system exceptions of the Armv7-M; interrupts are never taken. Where their vectors would be, `skyless flash` reads
+ * the name of the image. */
 typedef void (*handler)(void);
 
 __attribute__((section(".vectors"), used)) static const struct {
     const uint32_t *stack;
     handler handlers[15];
+    char name[sizeof(IMAGE_NAME)];
 } VECTORS = {
     stack_top,
     {reset_handler, on_fault, on_fault, on_fault, on_fault, on_fault, NULL, NULL, NULL, NULL, on_fault, on_fault, NULL,
      on_fault, on_fault},
+    IMAGE_NAME,
 };
 
 /* PSELRESET: the board's reset button. APPROTECT: the debug port stays open (with the write in `reset_handler`). A full

@@ -20,6 +20,7 @@ EXTRA_OF: Final = {
     "pandas": "pandas",
     "prometheus_client": "prometheus",
     "pyarrow": "history",
+    "pyocd": "flash",
     "rosbags": "ros2",
     "scipy": "site",
     "spidev": "pi",

@@ -8,6 +8,7 @@ import pytest
 from emulator.build import FIRMWARE, HAS_ARM_COMPILER, build
 from firmware_stage import STACK_BYTES, needs_processor
 
+from skyless.cli.nodes.flash import firmware
 from skyless.core.native.library import SOURCE
 from skyless.radio.dw1000.radio import SOURCES
 
@@ -58,6 +59,12 @@ def test_a_build_from_nothing_has_no_warning_starts_at_the_processors_vectors_an
     used = [handler for handler in handlers if handler]
     assert len(used) == 10
     assert all(handler & 1 and handler < max(memory) for handler in used)
+    assert bytes(memory[at] for at in range(64, 88)) == b"skyless-dwm1001 unknown\0"
+
+
+@needs_arm
+def test_the_image_states_the_version_of_the_project():
+    assert firmware(build("all").with_suffix(".hex"))
 
 
 @needs_arm

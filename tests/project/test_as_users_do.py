@@ -89,6 +89,9 @@ def test_the_readme_s_commands_on_a_fresh_copy(checkout, shell):
 
 def test_an_installed_wheel_runs_the_demo_a_modelled_radio_and_the_examples(checkout, shell, tmp_path):
     uv = shutil.which("uv") or str(ROOT / ".venv-uv" / "uv")
+    image = checkout / "firmware" / "build" / "skyless-dwm1001.hex"
+    image.parent.mkdir(exist_ok=True)
+    image.write_text(":00000001FF\n")
     run(shell, uv, "build", "--quiet", "--wheel", "--out-dir", tmp_path, checkout, cwd=tmp_path)
     (wheel,) = tmp_path.glob("*.whl")
     environment = tmp_path / "environment"
@@ -96,6 +99,8 @@ def test_an_installed_wheel_runs_the_demo_a_modelled_radio_and_the_examples(chec
     python, skyless = environment / "bin" / "python", environment / "bin" / "skyless"
     run(shell, uv, "pip", "install", "--quiet", "--python", python, f"{wheel}[page,history,research]")
 
+    (carried,) = environment.glob("lib/*/site-packages/skyless/radio/serial/*.hex")
+    assert carried.read_text() == image.read_text()
     assert json.loads(run(shell, skyless, "demo", "--duration", "3", "--json", cwd=tmp_path))["fixes"] > 0
 
     air, broker = f"127.0.0.1:{free_port()}", ("--mqtt", "none")

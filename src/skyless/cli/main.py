@@ -34,6 +34,7 @@ _GROUPS: Final = {
         ("plan", "plan", "Predict a site's errors before it is mounted, and place its anchors."),
         ("survey", "survey", "Find where anchors hang, and their antenna delays."),
         ("calibrate", "survey:calibrate_app", "Correct antenna delays by a tag at known positions."),
+        ("flash", "nodes.flash", "Put the firmware onto a board through a debug probe."),
         ("flash-config", "nodes.boards:flash_app", "Set up a board that computes its own position."),
         ("selftest", "nodes.selftest", "Test one or two boards in two minutes, before there is a site."),
         ("doctor", "nodes.doctor", "Check a computer, its boards and a running site in two minutes."),
