@@ -4,6 +4,7 @@ import cmath
 import math
 import struct
 
+import dw1000_published as published
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -12,8 +13,8 @@ from skyless.core.air.frame import Diagnostics, after_rmarker_s, fcs, preamble_s
 from skyless.core.ticks import TICK_RATE_HZ, wrap
 from skyless.sim.dw1000 import registers as r
 from skyless.sim.dw1000.chip import Chip, Sensors
-from skyless.sim.dw1000.registers import Access, decode_header
-from skyless.sim.dw1000.transceiver import HZ_PER_STEP, TUNED_TO_RECEIVE, TUNED_TO_SEND
+from skyless.sim.dw1000.registers import Access, Register, decode_header
+from skyless.sim.dw1000.transceiver import AGC_LOSS_DB, HZ_PER_STEP, TUNED_TO_RECEIVE, TUNED_TO_SEND
 
 TX_DELAY, RX_DELAY = 16_000, 17_000
 SLOW, FAST = 3_000_000, 20_000_000
@@ -89,6 +90,12 @@ class Bench:
         stamp = wrap(self.now_ticks() - round(after_rmarker_s(len(frame)) * TICK_RATE_HZ))
         told = told or Diagnostics(-80.0, -84.0, 2.0)
         return stamp, self.chip.receive(frame, stamp, told, fault, carrier_phase_cycles=phase_cycles)
+
+    def power_dbm(self):
+        """The power that it has measured, by the formula of UM 4.7.2."""
+        counted = self.read(r.RX_FINFO) >> 20
+        symbols = counted - 5 if counted == self.read(r.RXPACC_NOSAT) else counted
+        return 10.0 * math.log10(self.read(r.CIR_PWR) * 2**17 / symbols**2) - 121.74
 
     def sample(self, behind=1):
         """The accumulator's sample so far behind FP_INDEX, as a complex number."""
@@ -228,9 +235,8 @@ def test_a_received_frame_its_stamp_and_what_was_measured(bench):
     assert bench.read(r.RX_STAMP) == stamp
     counted = info >> 20
     symbols = counted - 5 if counted == bench.read(r.RXPACC_NOSAT) else counted
-    power_db = 10.0 * math.log10(bench.read(r.CIR_PWR) * 2**17 / symbols**2) - 121.74
     squares = sum(bench.read(f) ** 2 for f in (r.FP_AMPL1, r.FP_AMPL2, r.FP_AMPL3))
-    assert power_db == pytest.approx(told.rx_power_dbm, abs=0.01)
+    assert bench.power_dbm() == pytest.approx(told.rx_power_dbm, abs=0.01)
     assert 10.0 * math.log10(squares / symbols**2) - 121.74 == pytest.approx(told.first_path_power_dbm, abs=0.01)
     integrator = bench.read(r.DRX_CAR_INT)
     hertz = (integrator - (integrator >> 20 << 21)) * HZ_PER_STEP
@@ -331,6 +337,42 @@ def test_with_another_setting_it_hears_nothing_and_is_not_heard(bench, register,
     bench.write(r.SYS_CTRL, r.TRXOFF)
     bench.send(2e-3)
     assert len(bench.sent) == (why in ("rate", "prf") or register is r.DRX_TUNE2)  # these concern the receiver alone
+
+
+@pytest.mark.parametrize("driver", published.WRITTEN)
+def test_with_what_drivers_on_real_boards_write_it_receives_and_sends(driver):
+    bench, words = Bench(), published.WRITTEN[driver].split()
+    for place, value in zip(words[::2], words[1::2], strict=True):
+        bench.now_s += 200e-6
+        file, sub = (int(part, 16) for part in place.split(":"))
+        bench.write(Register(file, sub, len(value) // 2), int(value, 16))
+    bench.listen()
+    assert bench.hear()[1] == "heard"
+    lost_db = 0.0 if bench.read(r.AGC_TUNE3) else AGC_LOSS_DB
+    assert bench.power_dbm() == pytest.approx(-80.0 - lost_db, abs=0.01)
+    dx = bench.send(2e-3)
+    assert bench.sent == [(FRAME, wrap((dx & ~0x1FF) + TX_DELAY))]
+    assert bench.chip.transceiver.counts["sent-with-other-settings"] == 0
+    assert not +bench.chip.misuse
+
+
+def test_without_agc_tune3_what_is_weak_is_lost_and_the_receiver_stays_on(bench):
+    bench.write(r.AGC_TUNE3, 0)
+    bench.listen()
+    assert bench.hear(told=Diagnostics(-92.0, -93.0, 0.0))[1] == "too-weak"
+    assert bench.hear(told=Diagnostics())[1] == "heard"  # where the air knows no power
+
+
+def test_a_start_together_with_off_aborts_both_and_sends_nothing(bench):
+    """UM 5.3.1.2, as drivers cite it: it only sets the transmitter's delimiter up."""
+    bench.send(2e-3)
+    bench.write(r.SYS_CTRL, r.TXSTRT | r.TRXOFF)
+    assert bench.withdrawn == 1
+    bench.now_s += 5e-3
+    assert not bench.read(r.SYS_STATUS) & (r.TXFRB | r.TXFRS | r.HPDWARN)
+    bench.listen()
+    assert bench.hear()[1] == "heard"
+    assert not +bench.chip.misuse
 
 
 @pytest.mark.parametrize(
