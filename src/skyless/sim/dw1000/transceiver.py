@@ -54,7 +54,7 @@ _SUSPECT_TICKS: Final = 1024
 """Error of the stamp after an error without a receiver reset (assumed; UM 4.1.6 only warns of it)."""
 
 AGC_LOSS_DB: Final = 3.0
-"""How much weaker all is received unless AGC_TUNE3 is set (assumed); below the channel's sensitivity a frame is lost."""
+"""How much weaker all is received unless AGC_TUNE3 is set (assumed); what is then below the sensitivity is lost."""
 PRF_64_DB: Final = 121.74
 """The constant of both powers at 64 MHz PRF (UM 4.7.1, 4.7.2)."""
 _ACCUMULATED_SYMBOLS: Final = 118
@@ -305,14 +305,14 @@ class Transceiver:
         """
         memory = self._memory
         reason = self._why_not_received(antenna_ticks)
-        if reason is not None:
-            return reason
         if memory.get(r.AGC_TUNE3) != TUNED_TO_RECEIVE["AGC_TUNE3"]:
             powers_dbm = diagnostics.rx_power_dbm, diagnostics.first_path_power_dbm
             weaker_dbm = [None if power is None else power - AGC_LOSS_DB for power in powers_dbm]
             diagnostics = Diagnostics(*weaker_dbm, diagnostics.carrier_offset_ppm)
             if weaker_dbm[0] is not None and weaker_dbm[0] < ChannelModel().sensitivity_dbm:
-                return "too-weak"
+                reason = reason or "too-weak"
+        if reason is not None:
+            return reason
         if fault in ("header", "parity", "delimiter"):
             self._end_reception(_FAULT_EVENTS[fault], is_error=True)
             return "spoilt"
