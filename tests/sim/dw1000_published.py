@@ -151,8 +151,8 @@ OTP = {"LDOTUNE": 0x04, "PART_ID": 0x06, "LOT_ID": 0x07, "VOLTAGE": 0x08, "TEMPE
 RESETS = {"ALL": 0x00, "RX": 0xE0, "NONE": 0xF0}  # octet 3 of PMSC_CTRL0
 POWER_A_DB = 121.74  # PRF 64
 
-# What two drivers, which have run on many boards, write before they receive and send (channel 5, PRF 64 MHz, 6.8 Mbit/s,
-# code 9, 128 symbols): file:sub and the value, whose digits say how many octets. Read on 30 November 2026.
+# What two drivers, which have run on many boards, write before they receive and send (channel 5, PRF 64 MHz, code 9,
+# 6.8 Mbit/s, 128 symbols): file:sub and the value, whose digits say how many octets. Read on 30 November 2026.
 WRITTEN = {
     # Decawave/uwb-dw1000 (Mynewt; DWM1001-DEV), dw1000_phy.c at 861c51a2, dw1000_mac.c at 46fc9d69, dw1000_regs.h at
     # 7ecee2ff: AGC_TUNE3 stays unset, and a transmission is begun and aborted

@@ -306,10 +306,12 @@ class Transceiver:
         memory = self._memory
         reason = self._why_not_received(antenna_ticks)
         if memory.get(r.AGC_TUNE3) != TUNED_TO_RECEIVE["AGC_TUNE3"]:
-            powers_dbm = diagnostics.rx_power_dbm, diagnostics.first_path_power_dbm
-            weaker_dbm = [None if power is None else power - AGC_LOSS_DB for power in powers_dbm]
-            diagnostics = Diagnostics(*weaker_dbm, diagnostics.carrier_offset_ppm)
-            if weaker_dbm[0] is not None and weaker_dbm[0] < ChannelModel().sensitivity_dbm:
+            power_dbm, first_dbm = (
+                None if power is None else power - AGC_LOSS_DB
+                for power in (diagnostics.rx_power_dbm, diagnostics.first_path_power_dbm)
+            )
+            diagnostics = Diagnostics(power_dbm, first_dbm, diagnostics.carrier_offset_ppm)
+            if power_dbm is not None and power_dbm < ChannelModel().sensitivity_dbm:
                 reason = reason or "too-weak"
         if reason is not None:
             return reason
