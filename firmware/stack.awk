@@ -1,5 +1,5 @@
-# Bytes of stack on the deepest path from reset_handler, by the call graphs of an image's files (gcc -fcallgraph-info=su):
-#   awk -f stack.awk source/main.c build/arm/*.ci
+# Bytes of stack on the deepest path from reset_handler, by the call graphs (gcc -fcallgraph-info=su) of an image:
+#   awk -f stack.awk source/main.c FILE.ci ...
 # Refused are recursion, frames that grow at run time, and calls through pointers but those of struct hardware, which
 # count as the deepest of the functions in HARDWARE of main.c. libgcc's have no call graph; LIBRARY allows for each.
 BEGIN { FS = "\""; LIBRARY = 96 }
