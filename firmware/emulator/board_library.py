@@ -53,6 +53,10 @@ class Processor(radio.Bus, Protocol):
         """Keep settings."""
         self.settings = settings
 
+    def probe(self, item: int) -> int:  # noqa: ARG002
+        """A fact of the processor."""
+        return 0
+
     def advertise(self, data: bytes) -> bool:  # noqa: ARG002
         """Begin to send a Bluetooth advertisement; False while the last is on its way."""
         return True
@@ -94,6 +98,7 @@ class Hardware(radio.Hardware):
         ("sleep_for", ctypes.CFUNCTYPE(None, ctypes.c_uint32)),
         ("read_settings", ctypes.CFUNCTYPE(None, ctypes.c_void_p)),
         ("write_settings", ctypes.CFUNCTYPE(None, ctypes.c_void_p)),
+        ("probe", ctypes.CFUNCTYPE(ctypes.c_uint32, ctypes.c_int)),
         ("advertise", ctypes.CFUNCTYPE(ctypes.c_bool, ctypes.c_void_p, ctypes.c_uint32)),
     )
 
@@ -115,6 +120,7 @@ class Hardware(radio.Hardware):
             write_line=lambda line, size: self.call(processor.write_line, ctypes.string_at(line, size)),
             read_settings=read_settings,
             write_settings=lambda at: self.call(processor.write_settings, ctypes.string_at(at, KEPT_BYTES)),
+            probe=partial(self.call, processor.probe),
             advertise=lambda at, size: self.call(processor.advertise, ctypes.string_at(at, size)),
             **{
                 name: partial(self.call, getattr(processor, name))

@@ -40,7 +40,7 @@ static enum { NOISE_TURN, TAG_TURN, SOUND_TURN } stage; /* SOUND_TURN: a chip th
 static uint64_t line_bytes; /* and those of frames */
 static uint64_t written;
 static uint64_t sent;
-static uint64_t heard_kinds[LINK_TAG_CONFIG + 1u];
+static uint64_t heard_kinds[LINK_TEST + 1u];
 static uint64_t text_lines;
 
 /* The line: what it brings next, and hashes of the frames that it has brought to be sent */
@@ -269,15 +269,16 @@ static bool bring(const uint8_t *line, uint32_t size)
 /* What the host sends next. */
 static void refill(void)
 {
-    static const uint8_t KINDS[10] = {LINK_ASK_HELLO, LINK_CONFIG,         LINK_TX_AT,          LINK_TX_AT,    LINK_RX_ON,
-                                      LINK_ASK_STATUS, LINK_SET_TAG_CONFIG, LINK_ASK_TAG_CONFIG, LINK_SET_TIME, 0x77u};
+    static const uint8_t KINDS[12] = {LINK_ASK_HELLO,      LINK_CONFIG,         LINK_TX_AT,    LINK_TX_AT,
+                                      LINK_RX_ON,          LINK_ASK_STATUS,     LINK_READ,     LINK_TEST_LINE,
+                                      LINK_SET_TAG_CONFIG, LINK_ASK_TAG_CONFIG, LINK_SET_TIME, 0x77u};
     static const uint8_t USUAL[6] = {5u, 64u, 2u, 9u, 128u, 0u};
     static struct link_writer host = {.write_line = bring};
     struct settings settings;
     uint8_t body[160]; /* a record without kind and number */
     uint8_t *frame = &body[LINK_STAMP_BYTES];
     uint32_t size = any(140u);
-    uint32_t kind = KINDS[any(10u)];
+    uint32_t kind = KINDS[any(12u)];
     bool is_right = !one_in(4u);
 
     if ((stage == TAG_TURN) && ((kind == LINK_CONFIG) || (kind == LINK_SET_TAG_CONFIG)) && !one_in(50u)) {
@@ -302,6 +303,10 @@ static void refill(void)
         (void)memset(body, 0, LINK_STAMP_BYTES); /* soon */
         body[2] = (uint8_t)any(256u);
         size = LINK_STAMP_BYTES + frame_bytes;
+    } else if (is_right && (kind == LINK_READ)) {
+        size = LINK_READ_DATA_AT - LINK_BODY_AT;
+        body[3] = (uint8_t)(any(LINK_READ_BYTES) + 1u);
+        body[5] = 0u; /* of two bytes of times: at most 255 */
     } else if (is_right && (kind == LINK_SET_TAG_CONFIG)) {
         choose_settings(&settings);
         settings_pack(&settings, &body[LINK_SETTINGS_AT - LINK_BODY_AT]);
@@ -386,7 +391,7 @@ static void check_record(const uint8_t *line, uint32_t size)
     if (reader.record[1] != number) {
         fail("the board's numbers do not follow one another");
     }
-    if ((reader.record[0] < LINK_HELLO) || (reader.record[0] > LINK_TAG_CONFIG)) {
+    if ((reader.record[0] < LINK_HELLO) || (reader.record[0] > LINK_TEST)) {
         fail("the board wrote a record of an unknown kind");
     }
     if (reader.record[0] == LINK_FIX) {
@@ -472,12 +477,18 @@ static void read_frames(const char *path)
     (void)fclose(file);
 }
 
+static uint32_t probe(enum probe item)
+{
+    return (uint32_t)item;
+}
+
 /* The supply fails, and the board starts with what its flash holds. */
 static void restart(void)
 {
     static const struct hardware HARDWARE = {transfer,       set_spi_fast, do_nothing, pause_us,     now_us,
                                              interrupt_line, read_line,    write_line, restart_line, set_word, set_word,
-                                             sleep_for,      read_settings, write_settings, advertise};
+                                             sleep_for,      read_settings, write_settings, probe,
+                                             advertise};
     const struct board_identity identity = {true, {1u, 2u, 3u, 4u, 5u, 6u, 7u, 8u}, 0u};
 
     begin_ticks = now_ticks;
@@ -562,7 +573,7 @@ int main(int count, char **words)
     bytes = line_bytes;
     calm_down();
     (void)printf("%" PRIu64 " bytes in, %" PRIu64 " out; %" PRIu64 " frames to the chip; records:", bytes, written, sent);
-    for (uint32_t kind = LINK_HELLO; kind <= LINK_TAG_CONFIG; kind++) {
+    for (uint32_t kind = LINK_HELLO; kind <= LINK_TEST; kind++) {
         bool is_of_a_fix = (kind == LINK_FIX) || (kind == LINK_ANCHOR_PLACE) || (kind == LINK_GEOREFERENCE);
 
         (void)printf(" %" PRIu64, heard_kinds[kind]);

@@ -2,6 +2,8 @@
 
 #include <string.h>
 
+#include "selftest.h"
+
 /* Version of the firmware, in HELLO */
 static const uint8_t VERSION[3] = {0u, 3u, 0u};
 
@@ -38,6 +40,8 @@ static const uint8_t VERSION[3] = {0u, 3u, 0u};
 #define READ_BYTES 64u
 /* A chip that could not be started for a tag is tried again. */
 #define RETRY_US 1000000u
+/* A rate of the serial line that flash does not hold is given up when no record was understood at it for this time. */
+#define RATE_TRIAL_US 3000000u
 
 #ifndef PER_THREAD /* on a computer several boards run side by side */
 #define PER_THREAD
@@ -105,6 +109,20 @@ static void refuse(struct board *board, uint32_t kind, uint32_t reason)
     link_begin(&board->writer, LINK_REFUSED);
     link_append(&board->writer, kind, 1u);
     link_append(&board->writer, reason, 1u);
+    link_send(&board->writer);
+}
+
+/* The reason with how far the chip's start came. */
+static void refuse_radio(struct board *board)
+{
+    const struct dw1000 *chip = &board->chip;
+
+    link_begin(&board->writer, LINK_REFUSED);
+    link_append(&board->writer, LINK_CONFIG, 1u);
+    link_append(&board->writer, LINK_REFUSED_RADIO, 1u);
+    link_append(&board->writer, (uint32_t)chip->start_step, 1u);
+    link_append(&board->writer, chip->identifier, 4u);
+    link_append(&board->writer, chip->status, LINK_STATUS_OCTETS);
     link_send(&board->writer);
 }
 
@@ -329,7 +347,7 @@ static void configure(struct board *board, const uint8_t *record, uint32_t lengt
     if (board->is_configured) {
         send_status(board);
     } else {
-        refuse(board, LINK_CONFIG, LINK_REFUSED_RADIO);
+        refuse_radio(board);
     }
 }
 
@@ -371,7 +389,7 @@ static void use_settings(struct board *board)
     dw1000_idle(&board->chip);
     board->is_configured = false;
     board->is_receiving = false;
-    board->hardware->set_rate(is_tag(board) ? board->settings.baud : SETTINGS_DEFAULT.baud);
+    board->tests_left = 0u;
     if (is_tag(board)) {
         start_tag(board);
     }
@@ -396,6 +414,11 @@ static void change_settings(struct board *board, const uint8_t *record, uint32_t
             board->is_in_flash = read_settings(board, &settings);
         }
         send_settings(board);
+        if (board->is_in_flash) {
+            board->kept_baud = board->settings.baud;
+        }
+        board->understood_us = board->hardware->now_us();
+        board->hardware->set_rate(board->settings.baud);
         use_settings(board);
     }
 }
@@ -429,6 +452,16 @@ static void obey(struct board *board, const uint8_t *record, uint32_t length)
             tag_set_time(&board->tag, (int64_t)link_number(&record[LINK_BODY_AT], 8u));
         }
         break;
+    case LINK_READ:
+        if (!selftest_read(board, record, length)) {
+            refuse(board, LINK_READ, LINK_REFUSED_MALFORMED);
+        }
+        break;
+    case LINK_TEST_LINE:
+        if (!selftest_begin_line(board, record, length)) {
+            refuse(board, LINK_TEST_LINE, LINK_REFUSED_MALFORMED);
+        }
+        break;
     default:
         board->unknown++;
         break;
@@ -447,6 +480,7 @@ static bool serve_host(struct board *board)
         at += link_read(reader, &data[at], size - at);
         if (reader->length > 0u) {
             board->understood_until = reader->garbled;
+            board->understood_us = board->hardware->now_us();
             obey(board, reader->record, reader->length);
             tag_on_host(&board->tag); /* which a tag that begins by this command remembers, too */
         }
@@ -575,15 +609,16 @@ static uint32_t serve_tag(struct board *board, uint32_t now_us)
 void board_begin(struct board *board)
 {
     const uint8_t zero = 0u;
-    struct settings settings;
 
+    board->is_in_flash = read_settings(board, &board->settings);
+    if (!board->is_in_flash) {
+        board->settings = SETTINGS_DEFAULT;
+    }
+    board->kept_baud = board->settings.baud;
+    board->hardware->set_rate(board->settings.baud);
     (void)board->hardware->write_line(&zero, 1u);
     send_hello(board);
-    if (read_settings(board, &settings)) {
-        board->settings = settings;
-        board->is_in_flash = true;
-        use_settings(board);
-    }
+    use_settings(board);
 }
 
 uint32_t board_turn(struct board *board)
@@ -592,11 +627,17 @@ uint32_t board_turn(struct board *board)
     bool line_is_high = board->hardware->interrupt_line();
     bool is_busy = false;
     uint32_t tag_us = RETRY_US;
+    uint32_t test_us;
 
     board->is_own_slot = false;
     if (has_chip(board) && is_poll_due(board, line_is_high, now_us)) {
+        uint32_t received = board->chip.received;
+
         board->polled_us = now_us;
         is_busy = poll(board, line_is_high) || (line_is_high && !board->is_polled);
+        if (board->chip.received != received) {
+            board->reception_us = board->hardware->now_us() - now_us;
+        }
     }
     is_busy = serve_host(board) || is_busy;
     if (is_busy) {
@@ -612,6 +653,10 @@ uint32_t board_turn(struct board *board)
     if (is_tag(board)) {
         tag_us = serve_tag(board, now_us);
     }
+    if ((board->settings.baud != board->kept_baud) && ((now_us - board->understood_us) >= RATE_TRIAL_US)) {
+        board_begin(board);
+    }
+    test_us = selftest_turn(board, now_us);
     show(board, now_us);
-    return is_busy ? 0u : least(tag_us, idle_us(board, now_us));
+    return is_busy ? 0u : least(least(tag_us, test_us), idle_us(board, now_us));
 }

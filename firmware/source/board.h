@@ -43,6 +43,8 @@ struct board {
     /* A tag by itself */
     struct settings settings;
     bool is_in_flash; /* they are what flash holds */
+    uint32_t kept_baud; /* of flash, or of a new board */
+    uint32_t understood_us; /* when a record of the host was understood */
     uint32_t tried_us; /* when the chip was last started for it */
     struct tag tag;
 
@@ -50,6 +52,13 @@ struct board {
     uint32_t late;
     uint32_t unknown;
     uint32_t understood_until; /* garbled lines up to the last record */
+
+    /* For `skyless selftest` */
+    uint32_t reception_us; /* that the last reception took, from the look at the chip until its record was queued */
+    uint32_t tested;       /* records TEST_LINE that have come */
+    uint32_t tests_left;   /* records TEST to send */
+    uint32_t test_bytes;   /* of one on the line */
+    uint32_t test_due_us;
 
     /* The interrupt line */
     bool line_was_high;

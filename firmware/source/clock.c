@@ -8,6 +8,13 @@
 #define COUNTER_MASK 0xFFFFFFu
 
 static uint32_t offset_us; /* of the time to TIMER0's count */
+static bool is_slow_counting;
+
+/* Anomaly 87: a flag of the floating-point unit would end each sleep at once. */
+static void wait_for_event(void)
+{
+    __asm volatile("vmsr fpscr, %0\n\tdsb\n\twfi" : : "r"(0) : "memory");
+}
 
 static void start_crystal(void)
 {
@@ -17,12 +24,16 @@ static void start_crystal(void)
     }
 }
 
-/* The module's slow crystal takes some 0.25 s to start, and is off by some 100 ppm, as its users report. */
-void clock_start(void)
+/* The module's slow crystal takes some 0.25 s to start, and is off by some 100 ppm, as its users report. Anomaly 132, a
+ * clock that stops when it is started within 66 us of a reset, is not met: clearing the RAM takes longer. */
+void clock_start_slow(void)
 {
-    NVMC_ICACHECNF = 1u;
     CLOCK_LFCLKSRC = LFCLK_CRYSTAL;
     CLOCK_LFCLKSTART = 1u;
+}
+
+void clock_start(void)
+{
     start_crystal();
     TIMER0_BITMODE = TIMER_32_BITS;
     TIMER0_PRESCALER = TIMER_1_MHZ;
@@ -48,19 +59,24 @@ void clock_pause_us(uint32_t microseconds)
 void clock_sleep_us(uint32_t microseconds)
 {
     TIMER0_CC0 = clock_now_us() - offset_us + microseconds;
-    __asm volatile("dsb\n\twfi" ::: "memory");
+    wait_for_event();
 }
 
 /* Before RTC1 is used the slow clock must run and STOP be given, or its registers are wrong (anomaly 20). */
 static void start_slow_counter(void)
 {
-    while (CLOCK_LFCLKSTARTED == 0u) {
-    }
     RTC1_STOP = 1u;
     RTC1_CLEAR = 1u;
-    RTC1_INTENSET = RTC_INT_COMPARE0;
-    NVIC_ISER0 = 1u << RTC1_IRQ;
     RTC1_START = 1u;
+    is_slow_counting = true;
+}
+
+uint32_t clock_slow_count(void)
+{
+    if (!is_slow_counting && (CLOCK_LFCLKSTARTED != 0u)) {
+        start_slow_counter();
+    }
+    return is_slow_counting ? RTC1_COUNTER : 0u;
 }
 
 /* The watchdog runs on, or a sleep whose end is lost would never end. So the processor wakes for some us now and then. */
@@ -70,7 +86,11 @@ void clock_sleep_ms(uint32_t milliseconds)
     uint64_t passed = 0u;
     uint32_t begin_us;
 
+    while (CLOCK_LFCLKSTARTED == 0u) {
+    }
     start_slow_counter();
+    RTC1_INTENSET = RTC_INT_COMPARE0;
+    NVIC_ISER0 = 1u << RTC1_IRQ;
     begin_us = clock_now_us();
     TIMER0_STOP = 1u;
     TIMER0_SHUTDOWN = 1u; /* one that is only stopped draws current (anomaly 78) */
@@ -81,7 +101,7 @@ void clock_sleep_ms(uint32_t milliseconds)
 
         WDT_RR0 = WDT_RELOAD;
         RTC1_CC0 = (uint32_t)(passed + ((left < PIECE_PERIODS) ? left : PIECE_PERIODS)) & COUNTER_MASK;
-        __asm volatile("dsb\n\twfi" ::: "memory");
+        wait_for_event();
         RTC1_COMPARE0 = 0u;
         (void)RTC1_COMPARE0; /* the write has arrived before the interrupt is cleared (PS 15) */
         NVIC_ICPR0 = (1u << RTC1_IRQ) | (1u << TIMER0_IRQ);
@@ -90,6 +110,7 @@ void clock_sleep_ms(uint32_t milliseconds)
     start_crystal();
     passed += (RTC1_COUNTER - (uint32_t)passed) & COUNTER_MASK;
     RTC1_STOP = 1u;
+    is_slow_counting = false;
     TIMER0_CLEAR = 1u; /* whatever its shutdown has left of its count */
     TIMER0_START = 1u;
     offset_us = begin_us + (uint32_t)((passed * 15625u) / 512u);

@@ -10,7 +10,7 @@
 #include <stdint.h>
 
 #define LINK_MAJOR 1u
-#define LINK_MINOR 3u
+#define LINK_MINOR 4u
 
 /* From the board */
 #define LINK_HELLO 0x01u
@@ -25,6 +25,8 @@
 #define LINK_ANCHOR_PLACE 0x0Au
 #define LINK_GEOREFERENCE 0x0Bu
 #define LINK_TAG_CONFIG 0x0Cu
+#define LINK_VALUE 0x0Du
+#define LINK_TEST 0x0Eu
 
 /* From the host */
 #define LINK_ASK_HELLO 0x41u
@@ -35,6 +37,8 @@
 #define LINK_SET_TAG_CONFIG 0x46u
 #define LINK_ASK_TAG_CONFIG 0x47u
 #define LINK_SET_TIME 0x48u
+#define LINK_READ 0x49u
+#define LINK_TEST_LINE 0x4Au
 
 #define LINK_BODY_AT 2u /* after kind and number */
 #define LINK_TX_FRAME_AT 7u
@@ -42,6 +46,7 @@
 #define LINK_SETTINGS_AT 3u /* in both records of settings, after flags */
 #define LINK_IDENTITY_BYTES 8u
 #define LINK_STAMP_BYTES 5u
+#define LINK_STATUS_OCTETS 5u /* of SYS_STATUS in REFUSED */
 
 #define LINK_NO_VOLTAGE 0xFFFFu
 
@@ -50,6 +55,17 @@
 #define LINK_CAN_COMPUTE 0x04u
 #define LINK_WANTS_PHASES 0x01u /* flag in CONFIG */
 #define LINK_IN_FLASH 0x01u      /* flag in the records of settings: to be kept, or kept */
+
+/* What READ reads: a register file of the chip, or one of these */
+#define LINK_OTP 0x40u    /* a word of the chip's one-time programmable memory, at `sub` */
+#define LINK_FACTS 0x80u  /* of the processor (enum probe) */
+#define LINK_CLOCKS 0x81u /* microseconds, periods of the slow crystal, the chip's counter */
+#define LINK_COUNTS 0x82u
+#define LINK_READ_DATA_AT 9u
+#define LINK_READ_BYTES 16u /* of a register, at most */
+#define LINK_READ_TIMES 1000u /* at most */
+#define LINK_READ_SLOWLY 0x01u /* flag in READ: at the slow SPI clock */
+#define LINK_TEST_OVERHEAD 6u /* bytes of a record on the line besides its body */
 
 /* State in STATUS */
 #define LINK_IS_CONFIGURED 0x01u

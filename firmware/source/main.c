@@ -28,9 +28,12 @@ static void start_watchdog(void)
 
 /* The chip */
 
+static uint32_t spi_frequency = SPIM_2_MHZ;
+
 static void set_spi_fast(bool fast)
 {
-    SPIM_FREQUENCY = fast ? SPIM_8_MHZ : SPIM_2_MHZ;
+    spi_frequency = fast ? SPIM_8_MHZ : SPIM_2_MHZ;
+    SPIM_FREQUENCY = spi_frequency;
 }
 
 /* Both buffers have two bytes or more: of single ones the SPIM sends two (anomaly 58). */
@@ -64,7 +67,22 @@ static bool interrupt_line(void)
 static void connect_chip(void)
 {
     GPIOTE_CONFIG0 = GPIOTE_RISING_ON(PIN_CHIP_IRQ);
+    SPIM_PSEL_SCK = PIN_CHIP_SCK;
+    SPIM_PSEL_MOSI = PIN_CHIP_MOSI;
+    SPIM_PSEL_MISO = PIN_CHIP_MISO;
+    SPIM_CONFIG = 0u; /* mode 0, most significant bit first */
+    SPIM_FREQUENCY = spi_frequency;
     SPIM_ENABLE = SPIM_ENABLED;
+}
+
+/* Anomaly 89: a SPIM that has worked beside GPIOTE draws some 400 uA until its block was without power. */
+static void disconnect_chip(void)
+{
+    GPIOTE_CONFIG0 = 0u;
+    SPIM_ENABLE = 0u;
+    SPIM_POWER = 0u;
+    (void)SPIM_POWER;
+    SPIM_POWER = 1u;
 }
 
 /* Chip select low wakes a chip that sleeps from before a restart of the processor; its reset pin does not. It is ready
@@ -85,11 +103,6 @@ static void start_chip_pins(bool may_sleep)
     GPIO_PIN_CNF(PIN_CHIP_MISO) = PIN_INPUT_PULL_DOWN;
     GPIO_PIN_CNF(PIN_CHIP_IRQ) = PIN_INPUT_PULL_DOWN;
     GPIO_PIN_CNF(PIN_CHIP_RESET) = PIN_DISCONNECTED;
-    SPIM_PSEL_SCK = PIN_CHIP_SCK;
-    SPIM_PSEL_MOSI = PIN_CHIP_MOSI;
-    SPIM_PSEL_MISO = PIN_CHIP_MISO;
-    SPIM_CONFIG = 0u; /* mode 0, most significant bit first */
-    set_spi_fast(false);
     connect_chip();
     GPIOTE_INTENSET = 1u;
     NVIC_ISER0 = 1u << GPIOTE_IRQ;
@@ -148,9 +161,8 @@ static uint32_t reset_cause(void)
 
 static void prepare_sleep(void)
 {
-    if (CHIP_REVISION <= REVISION_1) {
-        POWER_KEEP_RAM = FICR_KEEP_RAM;
-    }
+    POWER_KEEP_RAM = FICR_KEEP_RAM;
+    POWER_DCDCEN = 1u; /* the module has the coil */
     GPIO_OUTSET = 1u << PIN_AWAKE;
     GPIO_PIN_CNF(PIN_AWAKE) = PIN_OUTPUT;
 }
@@ -171,14 +183,25 @@ static void sleep_for(uint32_t milliseconds)
     while (bluetooth_pump()) {
     }
     serial_port_stop();
-    GPIOTE_CONFIG0 = 0u;
-    SPIM_ENABLE = 0u;
+    disconnect_chip();
     clear_events();
     GPIO_OUTCLR = 1u << PIN_AWAKE;
     clock_sleep_ms(milliseconds);
     GPIO_OUTSET = 1u << PIN_AWAKE;
     connect_chip();
     serial_port_start();
+}
+
+static uint32_t probe(enum probe item)
+{
+    static const uint32_t WORDS[PROBE_STACK_BYTES] = {FICR_INFO_PART_ADDRESS, FICR_INFO_VARIANT_ADDRESS,
+                                                      CHIP_REVISION_ADDRESS, UICR_PSELRESET0_ADDRESS,
+                                                      UICR_APPROTECT_ADDRESS};
+
+    if (item < PROBE_STACK_BYTES) {
+        return REGISTER(WORDS[item]);
+    }
+    return (item == PROBE_SLOW_COUNT) ? clock_slow_count() : startup_stack_bytes(item == PROBE_STACK_USED);
 }
 
 static const struct hardware HARDWARE = {
@@ -196,6 +219,7 @@ static const struct hardware HARDWARE = {
     .sleep_for = sleep_for,
     .read_settings = flash_read,
     .write_settings = flash_write,
+    .probe = probe,
     .advertise = bluetooth_advertise,
 };
 
@@ -204,6 +228,7 @@ int main(void)
     struct board_identity identity = {0};
 
     identity.reset_cause = (uint8_t)reset_cause();
+    clock_start_slow(); /* first: the watchdog would start another source of the slow clock */
     start_watchdog();
     start_lights();
     clock_start();

@@ -15,14 +15,22 @@
 #define CLOCK_LFCLKSTARTED REGISTER(0x40000104u)
 #define CLOCK_LFCLKSRC REGISTER(0x40000518u)
 #define LFCLK_CRYSTAL 1u
+#define POWER_DCDCEN REGISTER(0x40000578u)
 #define POWER_RESETREAS REGISTER(0x40000400u)
 #define RESETREAS_MASK 0x0Fu /* 0 reset pin, 1 watchdog, 2 software, 3 lockup */
 #define RESETREAS_PIN 0x01u
 
-/* Anomaly 108 (nRF52832 errata, and Nordic's system_nrf52.c): revisions up to 1, which the chip calls 5, keep their RAM in
- * sleep only with a value that the factory has left for each chip. */
-#define CHIP_REVISION ((REGISTER(0xF0000FE8u) >> 4) & 0xFu)
-#define REVISION_1 5u
+/* Revisions 1 to 3 are 5 to 7 here. From revision 3 on the debug port is locked at each start unless UICR and the firmware
+ * both open it (PS 1.4 and Nordic's nrf52_approtect.h). */
+#define CHIP_REVISION ((CHIP_REVISION_WORD >> 4) & 0xFu)
+#define CHIP_REVISION_WORD REGISTER(CHIP_REVISION_ADDRESS)
+#define CHIP_REVISION_ADDRESS 0xF0000FE8u
+#define REVISION_3 7u
+#define APPROTECT_DISABLE REGISTER(0x40000558u)
+#define APPROTECT_OPEN 0x5Au
+
+/* Anomaly 108 (nRF52832 errata, and Nordic's nrf52_erratas.h): RAM is kept in sleep only with a value that the factory has
+ * left for each chip. */
 #define POWER_KEEP_RAM REGISTER(0x40000EE4u)
 #define FICR_KEEP_RAM (REGISTER(0x10000258u) & 0x4Fu)
 
@@ -75,7 +83,6 @@
 #define UARTE_PSEL_RXD REGISTER(0x40002514u)
 #define UARTE_BAUDRATE REGISTER(0x40002524u)
 #define UARTE_1_MBAUD 0x10000000u
-#define UARTE_921600_BAUD 0x0F000000u
 #define UARTE_460800_BAUD 0x07400000u
 #define UARTE_230400_BAUD 0x03B00000u
 #define UARTE_115200_BAUD 0x01D60000u
@@ -104,6 +111,8 @@
 #define SPIM_TXD_PTR REGISTER(0x40003544u)
 #define SPIM_TXD_MAXCNT REGISTER(0x40003548u)
 #define SPIM_CONFIG REGISTER(0x40003554u)
+/* Power of the whole block, whose registers it resets (Nordic's nrfx_spim.c; in no manual) */
+#define SPIM_POWER REGISTER(0x40003FFCu)
 
 /* GPIOTE (PS 21) */
 #define GPIOTE_IN0 REGISTER(0x40006100u)
@@ -159,7 +168,7 @@
 #define WDT_RELOAD 0x6E524635u
 #define WDT_RUNS_IN_SLEEP 1u /* and pauses while a debugger holds the processor */
 
-/* NVMC (PS 11), PPI (PS 22), GPIO (PS 20), FICR (PS 13) */
+/* NVMC (PS 11), PPI (PS 22), GPIO (PS 20), FICR (PS 13), UICR (PS 14) */
 #define NVMC_READY REGISTER(0x4001E400u)
 #define NVMC_CONFIG REGISTER(0x4001E504u)
 #define NVMC_READS 0u
@@ -183,6 +192,11 @@
 #define PIN_INPUT_PULL_DOWN 0x004u
 #define PIN_INPUT_PULL_UP 0x00Cu
 #define PIN_DISCONNECTED 0x002u
+#define FICR_INFO_PART_ADDRESS 0x10000100u
+#define FICR_INFO_VARIANT_ADDRESS 0x10000104u
+#define UICR_PSELRESET0_ADDRESS 0x10001200u
+#define UICR_APPROTECT_ADDRESS 0x10001208u
+#define PIN_RESET 21u
 #define FICR_DEVICEID ((const volatile uint32_t *)0x10000060u)
 #define FICR_DEVICEADDR ((const volatile uint32_t *)0x100000A4u)
 

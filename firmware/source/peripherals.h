@@ -8,7 +8,14 @@
 /* Whether a fault caused the last reset; asked once. */
 bool startup_take_fault(void);
 
-/* Start crystals and counter; it returns when the fast crystal runs. */
+/* The size of the stack, or how much of it was used at most since power-on. */
+uint32_t startup_stack_bytes(bool used);
+
+/* Start the slow crystal, which runs some 0.25 s later. */
+void clock_start_slow(void);
+/* Periods of the slow crystal, modulo 2^24, from the first call on; 0 until it runs. */
+uint32_t clock_slow_count(void);
+/* Start the fast crystal and the counter; it returns when the fast crystal runs. */
 void clock_start(void);
 /* Microseconds, which wrap at 32 bits. */
 uint32_t clock_now_us(void);

@@ -14,7 +14,7 @@ const struct settings SETTINGS_DEFAULT = {
     .mode = MODE_RADIO,
     .output = OUTPUT_RECORDS,
     .rate_hz = 10u,
-    .baud = 1000000u,
+    .baud = 460800u,
     .site = FIX_NO_SITE,
     .tag = 1u,
     .tx_delay_ticks = 16436u,
@@ -29,7 +29,7 @@ bool settings_check(const struct settings *settings)
     uint32_t baud = settings->baud;
 
     return (settings->mode <= MODE_TAG) && (settings->output <= OUTPUT_NONE) && (settings->rate_hz <= 50u) &&
-           ((baud == 115200u) || (baud == 230400u) || (baud == 460800u) || (baud == 921600u) || (baud == 1000000u)) &&
+           ((baud == 115200u) || (baud == 230400u) || (baud == 460800u) || (baud == 1000000u)) &&
            ((settings->bluetooth_ms == 0u) || ((settings->bluetooth_ms >= 100u) && (settings->bluetooth_ms <= 10240u))) &&
            (settings->site <= FIX_NO_SITE) && (settings->tag <= 0xFFFFu) && (settings->tx_delay_ticks <= 0xFFFFu) &&
            (settings->rx_delay_ticks <= 0xFFFFu) && (settings->has_bounds <= 1u) &&

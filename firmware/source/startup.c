@@ -7,6 +7,8 @@
 #include "peripherals.h"
 
 #define FAULT_MARK 0x0FA17ED0u
+#define UNUSED_STACK 0xA5A5A5A5u
+#define STACK_OF_RESET 64u /* bytes that `reset_handler` itself may use */
 
 /* From the linker script */
 extern uint32_t data_in_flash[];
@@ -14,6 +16,7 @@ extern uint32_t data_begin[];
 extern uint32_t data_end[];
 extern uint32_t bss_begin[];
 extern uint32_t bss_end[];
+extern uint32_t stack_bottom[];
 extern uint32_t stack_top[];
 
 int main(void);
@@ -28,6 +31,16 @@ bool startup_take_fault(void)
 
     fault_mark = 0u;
     return was_fault;
+}
+
+uint32_t startup_stack_bytes(bool used)
+{
+    const uint32_t *from = stack_bottom;
+
+    while (used && (from < stack_top) && (*from == UNUSED_STACK)) {
+        from++;
+    }
+    return (uint32_t)stack_top - (uint32_t)from;
 }
 
 /* There is no place for an error message: the serial line carries the link. HELLO reports the cause. */
@@ -45,9 +58,16 @@ void reset_handler(void)
     const uint32_t *from = data_in_flash;
 
     __asm volatile("cpsid i"); /* for good: interrupts only end the processor's sleep */
+    NVMC_ICACHECNF = 1u;
+    if (CHIP_REVISION >= REVISION_3) {
+        APPROTECT_DISABLE = APPROTECT_OPEN;
+    }
     SCB_CPACR |= CPACR_FPU;
     FPU_FPCCR = 0u; /* faults keep none of its registers: their handler has no floats */
     __asm volatile("dsb\n\tisb" ::: "memory");
+    for (uint32_t *to = stack_bottom; (uint32_t)to < ((uint32_t)stack_top - STACK_OF_RESET); to++) {
+        *to = UNUSED_STACK;
+    }
     for (uint32_t *to = data_begin; to < data_end; to++) {
         *to = *from;
         from++;
@@ -69,6 +89,10 @@ __attribute__((section(".vectors"), used)) static const struct {
     {reset_handler, on_fault, on_fault, on_fault, on_fault, on_fault, NULL, NULL, NULL, NULL, on_fault, on_fault, NULL,
      on_fault, on_fault},
 };
+
+/* PSELRESET: the board's reset button. APPROTECT: the debug port stays open (with the write in `reset_handler`). A full
+ * erase clears both. */
+__attribute__((section(".uicr"), used)) static const uint32_t UICR[3] = {PIN_RESET, PIN_RESET, 0xFFFFFF00u | APPROTECT_OPEN};
 
 /* What the compiler may call. */
 

@@ -33,6 +33,7 @@ void board_init(struct board *board, const struct hardware *functions, const str
 {
     (void)memset(board, 0, sizeof *board);
     hardware = functions;
+    hardware->set_rate(1000000u);
     board->identity = *identity;
 }
 

@@ -59,7 +59,7 @@ def test_a_board_reports_itself_and_is_configured_by_its_host():
     stage.board.begin()
     assert stage.bus.from_board[0] == 0
     for hello in stage.ask(ASK_HELLO, turns=2):
-        assert (hello.major, hello.minor, hello.device_id, hello.can_transmit) == (1, 3, b"identity", True)
+        assert (hello.major, hello.minor, hello.device_id, hello.can_transmit) == (1, 4, b"identity", True)
         assert hello.has_phases
         assert (hello.rate_khz, hello.counter_bits, hello.reset_cause) == (63_897_600, 40, 0x82)
     assert stage.ask(RX_ON, turns=2) == [NotDone(RX_ON, MALFORMED)]
@@ -284,7 +284,7 @@ def test_a_board_without_a_chip_says_so_and_goes_on():
     stage.config()
     stage.send(RX_ON)
     stage.turn(4)
-    assert stage.reports()[1:] == [NotDone(CONFIG, RADIO), NotDone(RX_ON, MALFORMED)]
+    assert stage.reports()[1:] == [NotDone(CONFIG, RADIO, start_step=1), NotDone(RX_ON, MALFORMED)]
     assert stage.bus.lights & 8
     stage.bus.present = True
     stage.ready()

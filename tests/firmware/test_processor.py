@@ -71,9 +71,9 @@ def program(tmp_path_factory):
 def start(program):
     """A function that makes a board with a program, or with the firmware, and lets so much time pass."""
 
-    def make(seconds=None, name=None, clock_ppm=0.0, can_transmit=True, **macros):
+    def make(seconds=None, name=None, clock_ppm=0.0, can_transmit=True, revision=5, baud=1_000_000, **macros):
         elf = build("all") if name is None else program(name, **macros)
-        stage = LoneBoard(elf, clock_ppm=clock_ppm, can_transmit=can_transmit)
+        stage = LoneBoard(elf, clock_ppm=clock_ppm, can_transmit=can_transmit, revision=revision, baud=baud)
         if seconds:
             stage.run(seconds)
         return stage
@@ -366,7 +366,7 @@ def test_settings_survive_restarts_and_a_cut_at_any_write(start):
         return stage.sent[sent:]
 
     def begun():
-        stage = start(5e-3, "SETTINGS")
+        stage = start(5e-3, "SETTINGS", baud=None)
         assert stage.sent[0] == 0
         write(stage, 0x11)
         assert stage.sent[-1] == 0x11

@@ -73,7 +73,7 @@ async def linked(place=None, **kind):
     """A board and a host that are in touch."""
     async with (
         PlayedBoard(place, **kind) as board,
-        radio_events(SerialRadio(board.pty.name, 1_000_000, "tag1")) as host,
+        radio_events(SerialRadio(board.pty.name, (1_000_000,), "tag1")) as host,
     ):
         await host.until(Restarted)
         yield board, host

@@ -26,7 +26,7 @@ class Worn(BoardTag):
 
 
 def serial(board):
-    return SerialRadio(board.pty.name, BAUD, "tag1", computing=UNTIL_NEXT_START)
+    return SerialRadio(board.pty.name, (BAUD,), "tag1", computing=UNTIL_NEXT_START)
 
 
 def found(board, changes=(), bauds=(BAUD,)):
@@ -50,7 +50,7 @@ async def test_a_board_that_cannot_be_set_up_is_named_in_words():
         with pytest.raises(SkylessError, match="computes no positions"):
             await found(board)
         board.pty.start(lambda data: None)
-        with pytest.raises(SkylessError, match="no board of Skyless answers"):
+        with pytest.raises(SkylessError, match="no board answers"):
             await found(board)
     with pytest.raises(SkylessError, match="there is no /dev/nothing"):
         await set_up("/dev/nothing", (BAUD,), UNTIL_NEXT_START)
@@ -99,7 +99,7 @@ async def test_a_board_that_does_not_compute_is_refused_in_words():
 
 
 async def test_a_plain_host_takes_no_notice_of_a_tag_s_records():
-    async with ComputingBoard() as board, radio_events(SerialRadio(board.pty.name, BAUD, "tag1")) as host:
+    async with ComputingBoard() as board, radio_events(SerialRadio(board.pty.name, (BAUD,), "tag1")) as host:
         await host.until(Restarted)
         board.report_all()
         board.report(link.FIX, b"short")

@@ -204,7 +204,7 @@ def test_a_board_of_another_major_version_is_refused_once_and_taken_when_it_has_
         talk.poll(STATUS_S)
     (gone,) = talk.events
     assert gone == Gone(
-        "the board at /dev/board has version 2.0 of the serial link, this program 1.3; bring the board's firmware "
+        "the board at /dev/board has version 2.0 of the serial link, this program 1.4; bring the board's firmware "
         "and Skyless to the same release"
     )
     assert set(talk.kinds()) == {link.ASK_HELLO}

@@ -116,7 +116,7 @@ async def test_the_counter_is_that_of_the_board():
 @pytest.mark.site
 async def test_a_board_that_is_pulled_out_and_plugged_in_is_found_again(tmp_path):
     place = tmp_path / "board"
-    async with radio_events(SerialRadio(str(place), 1_000_000, "tag1")) as host:
+    async with radio_events(SerialRadio(str(place), (1_000_000,), "tag1")) as host:
         assert f"there is no {place}" in (await host.until(Gone)).reason
         for time_s in (1, 2, 3):
             async with PlayedBoard(place) as board:
@@ -158,9 +158,9 @@ async def test_noise_on_the_line_costs_what_it_hits_and_is_counted():
 
 
 async def test_a_port_that_is_taken_or_no_port_is_reported_in_words():
-    async with linked() as (board, _), radio_events(SerialRadio(board.pty.name, 1_000_000, "tag2")) as second:
+    async with linked() as (board, _), radio_events(SerialRadio(board.pty.name, (1_000_000,), "tag2")) as second:
         assert "is used by another program" in (await second.until(Gone)).reason
-    async with radio_events(SerialRadio("/dev/null", 1_000_000, "tag2")) as null:
+    async with radio_events(SerialRadio("/dev/null", (1_000_000,), "tag2")) as null:
         assert "/dev/null is no serial port" in (await null.until(Gone)).reason
 
 
@@ -168,7 +168,7 @@ async def test_a_port_that_is_taken_or_no_port_is_reported_in_words():
 async def test_a_port_that_may_not_be_opened_is_reported_in_words():
     async with PlayedBoard() as board:
         Path(board.pty.path).chmod(0)
-        async with radio_events(SerialRadio(board.pty.path, 1_000_000, "tag1")) as host:
+        async with radio_events(SerialRadio(board.pty.path, (1_000_000,), "tag1")) as host:
             assert "dialout" in (await host.until(Gone)).reason
 
 
@@ -179,7 +179,7 @@ async def test_what_nobody_fetches_is_dropped_and_who_comes_later_receives_the_p
             board.hear(Reception(bytes(100), number))
         assert board.pty.overruns >= 1
         assert board.protocol.counts["unsent"] == board.pty.overruns
-        async with radio_events(SerialRadio(board.pty.name, 1_000_000, "tag1")) as host:
+        async with radio_events(SerialRadio(board.pty.name, (1_000_000,), "tag1")) as host:
             await host.until(Restarted)
             board.hear(Reception(b"now", 5000))
             assert [one.frame for one in [await host.until(Reception)]] == [b"now"]

@@ -65,7 +65,7 @@ def through_the_chip():
 async def over_the_line(heard):
     """The same receptions behind a board and a serial port."""
     board = PlayedBoard()
-    async with board, radio_events(SerialRadio(board.pty.name, 1_000_000, "tag1", phases=True)) as host:
+    async with board, radio_events(SerialRadio(board.pty.name, (1_000_000,), "tag1", phases=True)) as host:
         await host.until(Restarted)
         for at in range(0, len(heard), 20):
             for reception in heard[at : at + 20]:

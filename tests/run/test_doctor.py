@@ -138,7 +138,7 @@ def test_a_report_has_what_failed_first_and_nothing_that_controls_a_terminal():
 
 
 async def examined_board(path, seconds):
-    probe = BoardProbe(SerialRadio(str(path), 1_000_000, path.name), None)
+    probe = BoardProbe(SerialRadio(str(path), (1_000_000,), path.name), None)
     with contextlib.suppress(TimeoutError):
         await asyncio.wait_for(probe.run(), seconds)
     return probe.checks(NoiseSite())
@@ -151,7 +151,7 @@ async def test_a_port_that_is_not_there_is_told_and_so_is_a_device_of_another_ki
     assert "There is no " in check.finding
     terminal = Pty(tmp_path / "gps")
     terminal.start(lambda _: None)
-    probe = BoardProbe(SerialRadio(str(tmp_path / "gps"), 9600, "gps"), None)
+    probe = BoardProbe(SerialRadio(str(tmp_path / "gps"), (9600,), "gps"), None)
     listening = asyncio.ensure_future(probe.run())
     async with asyncio.timeout(20.0):
         while "wrong baud rate?" not in probe.checks(NoiseSite())[0].finding:
@@ -169,7 +169,7 @@ async def test_a_board_at_a_running_site_is_well(tmp_path):
         for number in (1, 2, 3, 4, 5, 6):
             site.anchor(number, site.air)
         site.plug_in("tag1")
-        probe = BoardProbe(SerialRadio(str(tmp_path / "tag1"), 1_000_000, "tag1"), None)
+        probe = BoardProbe(SerialRadio(str(tmp_path / "tag1"), (1_000_000,), "tag1"), None)
         listening = asyncio.ensure_future(probe.run())
         await until(lambda: probe.checks(NoiseSite())[1:2] and probe.checks(NoiseSite())[1].result == "ok", 30.0)
         listening.cancel()

@@ -30,7 +30,12 @@ def code_of(elf: Path) -> bytes:
     Raises:
         subprocess.CalledProcessError: it is no ELF file for this processor, here and below.
     """
-    return _told("objcopy", "-O", "binary", elf, "/dev/stdout")
+    return _told("objcopy", "-O", "binary", "--remove-section=.uicr", elf, "/dev/stdout")
+
+
+def configuration_of(elf: Path) -> bytes:
+    """What the image writes into UICR, from PSELRESET[0] on."""
+    return _told("objcopy", "-O", "binary", "--only-section=.uicr", elf, "/dev/stdout")
 
 
 def symbols_of(elf: Path) -> list[Symbol]:

@@ -18,7 +18,15 @@ IDENTITY: Final = b"identity"
 class LoneBoard:
     """One image on a line of 1 Mbaud, and the air, whose counter is true time."""
 
-    def __init__(self, elf: Path, *, can_transmit: bool = True, clock_ppm: float = 0.0) -> None:
+    def __init__(
+        self,
+        elf: Path,
+        *,
+        can_transmit: bool = True,
+        clock_ppm: float = 0.0,
+        revision: int = 5,
+        baud: int | None = 1_000_000,
+    ) -> None:
         self.timeline: Timeline[None] = Timeline()
         self.chip = Chip(self, DELAYS.tx_ticks, DELAYS.rx_ticks, self.now_s)
         self.frames: list[tuple[bytes, int]] = []
@@ -26,7 +34,7 @@ class LoneBoard:
         self.lines: list[tuple[float, bytes]] = []
         """What has come, with its time in µs."""
         seat = Seat(self.timeline, self.chip, self._note, can_transmit, IDENTITY)
-        self.image = Image(seat, elf=elf, clock_ppm=clock_ppm)
+        self.image = Image(seat, elf=elf, clock_ppm=clock_ppm, revision=revision, baud=baud)
 
     def _note(self, data: bytes) -> None:
         self.lines.append((1e6 * self.now_s(), data))

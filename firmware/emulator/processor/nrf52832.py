@@ -15,12 +15,14 @@ from typing import Final
 from emulator.processor import peripherals as p
 from emulator.processor.cortex_m4 import Core, EmulationError
 from emulator.processor.cycles import CPU_HZ, CYCLES
+from emulator.processor.elf import configuration_of
 from emulator.processor.paths import Paths
 from emulator.processor.processors import MIN_TICKS, TICKS_PER_CYCLE, Processors
 from emulator.processor.radio import OnAir, Radio
 from emulator.processor.serial_peripherals import Spim, Uarte
 from emulator.seat import Seat
 from skyless.core.ticks import TICK_S
+from skyless.radio.serial.link import BoardSettings, pack
 from skyless.sim.dw1000.registers import SYS_CTRL, SYS_STATUS
 
 WAKE_UP_CYCLES: Final = 3 * 64
@@ -36,7 +38,7 @@ LED_PINS: Final = {"D9": 30, "D10": 31, "D11": 22, "D12": 14}
 
 _WINDOWS: Final = [
     (p.FlashPage.base, 0x1000),
-    (0x10000000, 0x1000),
+    (0x10000000, 0x2000),
     (0x40000000, 0x20000),
     (0x50000000, 0x1000),
     (0xE000E000, 0x1000),
@@ -56,7 +58,10 @@ _COMMANDS: Final = bytes((0x80 | SYS_CTRL.file,))
 class Image:
     """A board that executes an ELF file's machine code; what is not modelled raises EmulationError when it is used."""
 
-    def __init__(self, seat: Seat, *, elf: Path, clock_ppm: float = 0.0) -> None:
+    def __init__(
+        self, seat: Seat, *, elf: Path, clock_ppm: float = 0.0, revision: int = 5, baud: int | None = 1_000_000
+    ) -> None:
+        """``revision`` of the processor as it states it; ``baud``: the serial line's by its flash, None for empty."""
         self.misuse: Counter[str] = Counter()
         """What the firmware did to its processor that the specification forbids, and bytes that it lost."""
         self.resets: Counter[str] = Counter()
@@ -75,9 +80,12 @@ class Image:
         self._life = 0
         self.advertised: list[OnAir] = []
         """What has left the Bluetooth antenna."""
+        self._revision, self._configuration = revision, configuration_of(elf)
         self.core = Core(elf, _WINDOWS, self._read, self._write)
         self.load, self.store = self.core.load, self.core.store
         self.settings = p.FlashPage(self, self.core.spend)
+        if baud is not None:
+            self.settings.hold(pack(BoardSettings(baud=baud)))
         self._start(cause=0, watchdog=None)
 
     # What the site sees
@@ -112,6 +120,12 @@ class Image:
         return self._clock.registers[0xEE4] == p.KEEP_RAM
 
     @property
+    def debug_is_open(self) -> bool:
+        """Whether a probe can reach the processor; from revision 3 on UICR and firmware both have to open it."""
+        is_open = self._configuration[8:9] == b"\x5a" and self._clock.registers.get(0x558) == 0x5A
+        return self._revision < p.REVISION_3 or is_open
+
+    @property
     def leds(self) -> frozenset[str]:
         """Lights that are on (``LED_PINS``); they are so when their pin is low."""
         return frozenset(name for name, pin in LED_PINS.items() if self.gpio.is_driven(pin, high=False))
@@ -123,7 +137,7 @@ class Image:
             "crystal": self._clock.crystal_cycles < 1 << 62,
             "timer": any(timer.draws_current for timer in self._timers),
             "uarte": self._uarte.registers[0x500] != 0,
-            "spim": self._spim.registers[0x500] != 0,
+            "spim": self._spim.draws_current,
             "gpiote": any(self._gpiote.registers[at] for at in self._gpiote.CONFIG),
             "radio": self.radio.is_busy,
         }
@@ -148,12 +162,12 @@ class Image:
         """Peripherals as after a reset; a watchdog that is given runs on."""
         self._life += 1
         self._reset_asked = False
-        self._clock = p.Clock(self, cause)
+        self._clock = p.Clock(self, cause, self._revision)
         self._timers = [p.Timer(self, number) for number in range(3)]
         self._counters: list[p.Timer | p.Rtc] = [*self._timers, p.Rtc(self)]
         self.gpio = p.Gpio(self, self._level, self._on_output)
         self._gpiote = p.Gpiote(self)
-        self._watchdog = watchdog or p.Watchdog(self)
+        self._watchdog = watchdog or p.Watchdog(self, lambda: self._clock.is_slow_started)
         self._ppi = p.Ppi(self)
         self.settings.is_writable = False
         self._nvmc = p.Nvmc(self, self.core.use_cache, self.settings)
@@ -178,7 +192,8 @@ class Image:
                 self._uarte,
                 self._spim,
                 p.factory_information(self, self._seat.identity),
-                p.revision(self),
+                p.configuration(self, self._configuration),
+                p.identification(self, self._revision),
             )
         }
         self._selected, self._selected_cycles = False, 0

@@ -148,14 +148,24 @@ class Constants(Peripheral):
 
 
 def factory_information(system: System, identity: bytes) -> Constants:
-    """FICR: the device's identifier and Bluetooth address, low words first; what anomaly 108 needs."""
+    """FICR: the device's identifier and Bluetooth address, low words first; part; what anomaly 108 needs."""
     words = {0x060 + 4 * n: int.from_bytes(identity[4 * n : 4 * n + 4], "little") for n in range(2)}
-    return Constants(system, 0x10000000, words | {0x0A4: 0x89ABCDEF, 0x0A8: 0xFFFF0123, 0x258: 0xFFFFFF00 | KEEP_RAM})
+    words |= {0x0A4: 0x89ABCDEF, 0x0A8: 0xFFFF0123, 0x100: 0x52832, 0x104: 0x41414530, 0x258: 0xFFFFFF00 | KEEP_RAM}
+    return Constants(system, 0x10000000, words)
 
 
-def revision(system: System) -> Constants:
-    """Identification of the processor: an nRF52832 of revision 1, which is 5 there."""
-    return Constants(system, 0xF0000000, {0xFE0: 0x06, 0xFE4: 0x00, 0xFE8: 0x50})
+def configuration(system: System, written: bytes) -> Constants:
+    """UICR from PSELRESET[0] on, as it was flashed."""
+    words = (int.from_bytes(written[at : at + 4], "little") for at in range(0, len(written), 4))
+    return Constants(system, 0x10001000, dict(zip(range(0x200, 0x20C, 4), words, strict=False)))
+
+
+REVISION_3: Final = 7
+
+
+def identification(system: System, revision: int) -> Constants:
+    """Identification of an nRF52832; its revisions 1 to 3 are 5 to 7 there."""
+    return Constants(system, 0xF0000000, {0xFE0: 0x06, 0xFE4: 0x00, 0xFE8: revision << 4})
 
 
 class Clock(Peripheral):
@@ -164,7 +174,7 @@ class Clock(Peripheral):
     base = 0x40000000
     irq = 0
 
-    def __init__(self, system: System, cause: int) -> None:
+    def __init__(self, system: System, cause: int, revision: int) -> None:
         super().__init__(
             system,
             tasks={
@@ -175,9 +185,11 @@ class Clock(Peripheral):
                 0x078: lambda: None,
             },
             events=(0x100, 0x104),
-            registers=(0x400, 0x518, 0x578, 0xEE4),  # RESETREAS, LFCLKSRC, DCDCEN, and the one of anomaly 108
+            # RESETREAS, LFCLKSRC, DCDCEN, the one of anomaly 108, and APPROTECT.DISABLE
+            registers=(0x400, 0x518, 0x578, 0xEE4, *((0x558,) if revision >= REVISION_3 else ())),
         )
         self.registers[0x400] = cause
+        self.is_slow_started = False
         self._ready = {0x100: _NEVER, 0x104: _NEVER}
         self.crystal_cycles = _NEVER
         """When the fast crystal is stable."""
@@ -186,6 +198,7 @@ class Clock(Peripheral):
         self._ready[0x100] = self.crystal_cycles = self.system.cycles + HFCLK_START_CYCLES
 
     def _start_lfclk(self) -> None:
+        self.is_slow_started = True
         self._ready[0x104] = self.system.cycles + LFCLK_START_CYCLES
 
     def _stop_hfclk(self) -> None:
@@ -430,12 +443,14 @@ class Watchdog(Peripheral):
     base = 0x40010000
     irq = 16
 
-    def __init__(self, system: System) -> None:
+    def __init__(self, system: System, has_clock: Callable[[], bool]) -> None:
+        """``has_clock``: whether the slow clock was started; the watchdog would choose its source otherwise."""
         registers = (0x504, 0x508, 0x50C)  # CRV, RREN, CONFIG
         super().__init__(system, tasks={0x000: self._start}, events=(0x100,), registers=registers)  # TIMEOUT
         self.registers |= {0x504: 0xFFFFFFFF, 0x508: 1, 0x50C: 1}
         self.due_cycles = _NEVER
         self._fed = 0
+        self._has_clock = has_clock
 
     @property
     def is_running(self) -> bool:
@@ -448,6 +463,8 @@ class Watchdog(Peripheral):
 
     def _start(self) -> None:
         """Its settings are fixed from now on."""
+        if not self._has_clock():
+            self.system.misuse["watchdog-before-slow-clock"] += 1
         if not self.is_running:
             self._restart()
 
@@ -526,6 +543,11 @@ class FlashPage(Peripheral):
         self.is_writable = False
         self._wait = wait
         self.registers = dict.fromkeys(range(0, 0x1000, 4), 0xFFFFFFFF)
+
+    def hold(self, data: bytes) -> None:
+        """Contents from before the start."""
+        data += bytes(-len(data) % 4)
+        self.registers |= {at: int.from_bytes(data[at : at + 4], "little") for at in range(0, len(data), 4)}
 
     def erase(self, address: int, *, enabled: bool) -> None:
         """Set all bits."""

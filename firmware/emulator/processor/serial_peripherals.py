@@ -1,6 +1,7 @@
 """UARTE0 and SPIM0: what moves data by DMA, in the time that its bits take."""
 
 from collections.abc import Callable
+from functools import partial
 
 from emulator.processor.peripherals import Peripheral, System
 from skyless.sim.dw1000.registers import decode_header
@@ -17,6 +18,8 @@ class Uarte(Peripheral):
     base = 0x40002000
     irq = 2
     _ENDRX, _ENDTX, _RXDRDY, _TXDRDY, _RXTO, _TXSTOPPED = 0x110, 0x120, 0x108, 0x11C, 0x144, 0x158
+    _DMA_CYCLES = 32
+    """From RXDRDY until the byte is in RAM (assumed; the specification promises nothing)."""
     _SET_UP = (0x508, 0x50C, 0x510, 0x514, 0x524, 0x56C)
     """PSEL, BAUDRATE, CONFIG."""
 
@@ -108,7 +111,8 @@ class Uarte(Peripheral):
             if not self._is_receiving or self._filled == self._room:
                 self.system.misuse["uarte-byte-lost"] += 1
                 continue
-            self.system.store(self._into + self._filled, bytes((byte,)))
+            store = partial(self.system.store, self._into + self._filled, bytes((byte,)))
+            self.system.plan(self.system.cycles + self._DMA_CYCLES, store)
             self._filled += 1
             self.happen(self._RXDRDY)
             if self._filled == self._room:
@@ -177,8 +181,10 @@ class Spim(Peripheral):
             tasks={0x010: self._start, 0x014: lambda: self.happen(0x104)},  # a transfer that runs goes on to its end
             events=(0x104, 0x110, 0x118, 0x120, 0x14C),  # STOPPED, ENDRX, END, ENDTX, STARTED
             # SHORTS, ENABLE, PSEL, FREQUENCY, DMA, CONFIG, ORC
-            registers=(*(0x200, 0x500, 0x508, 0x50C, 0x510, 0x524), *range(0x534, 0x550, 4), 0x554, 0x5C0),
+            registers=(*(0x200, 0x500, 0x508, 0x50C, 0x510, 0x524), *range(0x534, 0x550, 4), 0x554, 0x5C0, 0xFFC),
         )
+        self.draws_current = False
+        """Also switched off, beside GPIOTE, until its block was without power (anomaly 89)."""
         self._exchange = exchange
         self.end_cycles: int | None = None
         """When the transfer that runs will be over."""
@@ -192,6 +198,11 @@ class Spim(Peripheral):
             self.system.misuse["spim-transfer-too-long"] += 1
             value &= 255
         super().write(offset, value)
+        if offset == 0xFFC and not value & 1:
+            self.registers = dict.fromkeys(self.registers, 0)
+            self.draws_current = False
+        elif offset == 0x500 and value:
+            self.draws_current = True
 
     @property
     def hz(self) -> int:

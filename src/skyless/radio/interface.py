@@ -2,13 +2,16 @@
 
 from collections import Counter
 from collections.abc import Callable
-from typing import Protocol
+from typing import Final, Protocol
 
 from msgspec import Struct
 
 from skyless.core.air.frame import Reception, Transmission
 from skyless.core.ticks import DEFAULT_ANTENNA_DELAY_TICKS
 from skyless.radio.tag_reports import Reported
+
+NOTABLE_SHARE: Final = 0.005
+"""Share of a radio's records that are spoilt on their way, from which on it matters: 1 % when rounded."""
 
 
 class AntennaDelays(Struct, frozen=True):

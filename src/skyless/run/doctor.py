@@ -19,9 +19,9 @@ from skyless.core.any_receiver import decode_any
 from skyless.core.site import NoiseSite
 from skyless.core.tag.receiver import TagReceiver
 from skyless.core.ticks import TICK_S, continued
-from skyless.radio.interface import Gone, Hint, RadioEvent
+from skyless.radio.interface import NOTABLE_SHARE, Gone, Hint, RadioEvent
 from skyless.radio.serial.link import Hello
-from skyless.radio.serial.serial_radio import SerialRadio
+from skyless.radio.serial.serial_radio import SPOILT_SHARE, SerialRadio, spoilt_line
 from skyless.run.mqtt.messages import FixMessage
 from skyless.run.tag import TagNode, TagSettings
 
@@ -151,6 +151,7 @@ class BoardProbe:
         self.radio = radio
         self._troubles: dict[str, None] = {}  # each once, in order
         self._hello: Hello | None = None
+        self._spoilt_share = 0.0
         self._heard: Counter[int] = Counter()
         self._fixes: list[FixMessage] = []
         self._pairs = CounterPairs()
@@ -162,6 +163,7 @@ class BoardProbe:
 
     def _on_event(self, event: RadioEvent) -> None:
         self._hello = self.radio.hello or self._hello
+        self._spoilt_share = self.radio.spoilt_share or self._spoilt_share
         if isinstance(event, Gone | Hint):
             self._troubles[event.reason if isinstance(event, Gone) else event.text] = None
         self._node.on_event(event)
@@ -183,7 +185,11 @@ class BoardProbe:
         version = ".".join(map(str, hello.firmware))
         abilities = "can send" if hello.can_transmit else "only listens"
         finding = f"Firmware {version}, version {hello.major}.{hello.minor} of the serial link; it {abilities}."
-        board = Check(name, "warning" if troubles else "ok", finding, troubles)
+        spoilt = self._spoilt_share
+        result: Result = "failed" if spoilt >= SPOILT_SHARE else "warning" if troubles else "ok"
+        board = Check(name, result, finding, troubles or spoilt_line(self.radio.name, spoilt) if result != "ok" else "")
+        if spoilt >= NOTABLE_SHARE:  # what few frames seem to say of the site would be wrong
+            return board, Check(f"{name}, reception", "not checked", "The line spoils too much.", "Mend it first.")
         return board, self._reception(f"{name}, reception"), counters_check(self._pairs, noise, f"{name}, clock")
 
     def _reception(self, name: str) -> Check:

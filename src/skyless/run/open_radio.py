@@ -21,7 +21,8 @@ if TYPE_CHECKING:
 # ruff: noqa: PLC0415 - a tag loads its own kind of radio only
 
 DEFAULT_RADIO: Final = f"ether:127.0.0.1:{DEFAULT_PORT}"
-_SERIAL_BAUD: Final = 1_000_000
+_SEARCH: Final = 0
+"""Instead of a baud rate: look for the board at all of them."""
 _FOREIGN_BAUD: Final = 115_200
 """Baud rate of listeners and FiRa boards; a real sniffer's USB port accepts any rate."""
 _EXPECTED: Final = (
@@ -90,13 +91,16 @@ def open_radios(
             raise SkylessError(f"--radio is {spec!r}; a chip on SPI carries one node, not {len(names)}")
         return (Dw1000Radio(spi_port(spec, where), names[0], settings[0], phases=phases),)
     if driver == "serial":
+        from skyless.radio.serial.link import BAUDS
         from skyless.radio.serial.serial_radio import UNTIL_NEXT_START, SerialRadio
 
-        ports, transmits = _ports(spec, where, _SERIAL_BAUD, names), kind == "anchor"
+        ports, transmits = _ports(spec, where, _SEARCH, names), kind == "anchor"
         computing = UNTIL_NEXT_START if computes else None
         return tuple(
-            SerialRadio(*ports[i], name, settings[i], transmits=transmits, phases=phases, computing=computing)
-            for i, name in enumerate(names)
+            SerialRadio(
+                path, (baud,) if baud else BAUDS, name, own, transmits=transmits, phases=phases, computing=computing
+            )
+            for (path, baud), name, own in zip(ports, names, settings, strict=True)
         )
     if driver in ("listener", "sniffer", "uci", "phone") and kind == "anchor":
         raise SkylessError(f"--radio is {spec!r}; it should be one that can transmit: a {driver} only listens")

@@ -18,7 +18,7 @@ from skyless.core.method_names import DEFAULT_METHOD
 from skyless.core.motion_sample import MotionSample
 from skyless.core.tag.receiver import NOT_DROPS, Receiver, SiteListener, TagReceiver
 from skyless.core.trusted_receiver import GivenFix, SiteTrust, Trust, TrustedReceiver
-from skyless.radio.interface import Gone, Hint, Radio, RadioEvent, Restarted
+from skyless.radio.interface import NOTABLE_SHARE, Gone, Hint, Radio, RadioEvent, Restarted
 from skyless.radio.tag_reports import BoardFix, BoardReceiver, Reported
 from skyless.run.fix_log import FIX_LEAVES_S, FixListener, FixLog, PhaseLog
 from skyless.run.keys import Remembered, TagMemory, TagReport, trust_reason
@@ -131,6 +131,12 @@ class TagNode:
         needs_trust = trusted is not None and trusted.trust.trust is not Trust.OPEN
         return (trust_reason(trusted) if trusted and needs_trust else None) or str(self.receiver.reason)
 
+    @property
+    def _multipath_m(self) -> tuple[float, float] | None:
+        """The receiver's, unless the radio's line spoils so much that ranges say nothing about the site."""
+        lost = self.radio.counters["lost-record"]
+        return None if lost > NOTABLE_SHARE * (self.receptions + lost) else self.receiver.multipath_m
+
     def complete(self, health: TagHealth) -> TagHealth:
         """Add phases, multipath and verification to the health message."""
         trusted, phases = self._trusted, self.receiver.phase_anchors
@@ -139,7 +145,7 @@ class TagNode:
         )
         if (note := self.receiver.motion_note) is not None:
             health = replace(health, notes=(*health.notes, note))
-        if (multipath := self.receiver.multipath_m) is not None:
+        if (multipath := self._multipath_m) is not None:
             health = replace(health, multipath_std_m=multipath[0], multipath_distance_m=multipath[1])
         if trusted is None:
             return health
@@ -178,7 +184,7 @@ class TagNode:
         if kind != self._motion_note:
             self._motion_note = kind
             self._log(f"tag {self.name}: {note or 'nothing is wrong with the motion sensor any more'}")
-        if not self._has_logged_multipath and (found := self.receiver.multipath_m) is not None:
+        if not self._has_logged_multipath and (found := self._multipath_m) is not None:
             self._has_logged_multipath = True
             std_m, distance_m = found
             self._log(

@@ -7,7 +7,7 @@ from collections.abc import Iterable
 from errno import EADDRINUSE
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Final, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import msgspec
 from cyclopts import App
@@ -41,7 +41,7 @@ from skyless.cli.nodes.options import (
 from skyless.core.errors import SkylessError
 from skyless.core.ticks import from_seconds
 from skyless.radio.emulated import DEFAULT_PORT
-from skyless.radio.serial.link import MODES, OUTPUTS, BoardSettings
+from skyless.radio.serial.link import BAUDS, MODES, OUTPUTS, BoardSettings
 from skyless.radio.serial.serial_port import check_path
 from skyless.radio.serial.serial_radio import Computing, set_up
 from skyless.run.board import RADIO_OF, Board
@@ -181,8 +181,6 @@ def _move(text: str, anchors: Iterable[int]) -> "AnchorDisplacement":
     return AnchorDisplacement(known[name], x_m, y_m, z_m, from_s)
 
 
-_BAUDS: Final = (1_000_000, 115_200, 230_400, 460_800, 921_600)
-
 flash_app = App(
     name="flash-config", help_epilogue="Example: skyless flash-config --mode tag --output nmea --rate-hz 10"
 )
@@ -201,7 +199,7 @@ class FlashOptions(Options, frozen=True, kw_only=True):
     """What a tag says on its serial port: records for skyless tag --from-board, NMEA 0183, JSON lines, or nothing."""
     rate_hz: Literal[0, 1, 5, 10, 25, 50] | None = None
     """Fixes a second on the serial port at most; 0 for all."""
-    baud: Literal[115_200, 230_400, 460_800, 921_600, 1_000_000] | None = None
+    baud: Literal[115_200, 230_400, 460_800, 1_000_000] | None = None
     """Rate of the serial port, from the answer on."""
     bluetooth_ms: Annotated[int, whole(0, 10_240)] | None = None
     """Interval of the Bluetooth advertisements in ms, from 100; 0 for none."""
@@ -263,7 +261,7 @@ def flash_config(*, asked: FlashOptions, output: JsonOptions) -> None:
         raise wrong("--radio", asked.radio, "a board, serial:PATH[@BAUD], as serial:/dev/ttyACM0")
     check_path(asked.radio, path)
     changes = (asdict(BoardSettings()) if asked.defaults else {}) | asked.changes()
-    bauds = (int(baud),) if baud else _BAUDS
+    bauds = (int(baud),) if baud else BAUDS
     found = asyncio.run(set_up(path, bauds, Computing(changes, keeps=bool(changes))))
     settings, shown = found.settings, asdict(found.settings)
     shown |= {"mode": MODES[settings.mode], "output": OUTPUTS[settings.output]}

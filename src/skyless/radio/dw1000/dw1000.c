@@ -234,7 +234,8 @@ static void off_and_clear(struct dw1000 *chip)
 
 static bool is_there(struct dw1000 *chip)
 {
-    return read_number(chip, 0x00u, 4u) == DEVICE_ID;
+    chip->identifier = (uint32_t)read_number(chip, 0x00u, 4u);
+    return chip->identifier == DEVICE_ID;
 }
 
 /* Crystal clock; nothing to be restored by the always-on block; SOFTRESET (UM 7.2.50.1, 7.2.45). */
@@ -252,13 +253,13 @@ static void soft_reset(struct dw1000 *chip)
     write_register(chip, 0x36u, 0x00u, 2u, 0x0201u);
 }
 
-/* First octet of a word of the one-time programmable memory (UM 6.3.2, 7.2.46). */
-static uint32_t read_otp(struct dw1000 *chip, uint32_t address)
+/* UM 6.3.2, 7.2.46 */
+uint32_t dw1000_read_otp(struct dw1000 *chip, uint32_t address)
 {
     write_register(chip, 0x2Du, 0x04u, 2u, address);
     write_register(chip, 0x2Du, 0x06u, 1u, 0x03u); /* OTP_CTRL: OTPRDEN, OTPREAD */
     write_register(chip, 0x2Du, 0x06u, 1u, 0x00u);
-    return read_register(chip, 0x2Du, 0x0Au, 4u)[0];
+    return (uint32_t)number(read_register(chip, 0x2Du, 0x0Au, 4u), 4u);
 }
 
 /* What was measured when the chip or module was made: supply, temperature, crystal (UM 2.5.5.11, 8.1, 6.4). */
@@ -267,12 +268,12 @@ static void calibrate(struct dw1000 *chip)
     uint32_t trim;
 
     write_register(chip, 0x24u, 0x00u, 4u, 0x04u); /* EC_CTRL: PLLLDT, or CPLOCK means nothing (UM 7.2.37.1) */
-    if (read_otp(chip, OTP_LDOTUNE) != 0u) {
+    if ((dw1000_read_otp(chip, OTP_LDOTUNE) & 0xFFu) != 0u) {
         write_register(chip, 0x2Du, 0x12u, 1u, 0x02u); /* OTP_SF: LDO_KICK */
     }
-    chip->voltage_33 = read_otp(chip, OTP_VOLTAGE);
-    chip->temperature_23 = read_otp(chip, OTP_TEMPERATURE);
-    trim = read_otp(chip, OTP_CRYSTAL_TRIM) & 0x1Fu;
+    chip->voltage_33 = dw1000_read_otp(chip, OTP_VOLTAGE) & 0xFFu;
+    chip->temperature_23 = dw1000_read_otp(chip, OTP_TEMPERATURE) & 0xFFu;
+    trim = dw1000_read_otp(chip, OTP_CRYSTAL_TRIM) & 0x1Fu;
     if (trim == 0u) {
         trim = 0x10u; /* not trimmed: mid-range */
     }
@@ -292,9 +293,10 @@ static bool lock(struct dw1000 *chip)
 {
     write_register(chip, 0x36u, 0x00u, 2u, PMSC_RUNNING);
     for (uint32_t tries = 0u; tries < LOCK_TRIES; tries++) {
-        chip->hardware->pause_us(100u);
+        chip->hardware->pause_us(LOCK_TRY_US);
         read_status(chip);
         if ((chip->status & CPLOCK) != 0u) {
+            chip->lock_us = (tries + 1u) * LOCK_TRY_US;
             return true;
         }
     }
@@ -324,10 +326,12 @@ static bool configure(struct dw1000 *chip, uint32_t tx_antenna_delay, uint32_t r
 {
     calibrate(chip);
     load_microcode(chip);
+    chip->start_step = DW1000_NO_LOCK;
     if (!lock(chip)) {
         return false;
     }
     chip->hardware->set_spi_fast(true);
+    chip->start_step = DW1000_NO_FAST_ANSWER;
     if (!is_there(chip)) {
         return false;
     }
@@ -342,6 +346,7 @@ static bool configure(struct dw1000 *chip, uint32_t tx_antenna_delay, uint32_t r
     write_register(chip, 0x2Eu, 0x1804u, 2u, rx_antenna_delay); /* LDE_RXANTD (7.2.47.5) */
     write_register(chip, 0x0Eu, 0u, 4u, SYS_MASK_EVENTS);
     off_and_clear(chip);
+    chip->start_step = DW1000_STARTED;
     chip->state = DW1000_IDLE;
     return true;
 }
@@ -358,6 +363,7 @@ static bool is_woken(struct dw1000 *chip)
 bool dw1000_start(struct dw1000 *chip, uint32_t tx_antenna_delay, uint32_t rx_antenna_delay)
 {
     chip->state = DW1000_OFF;
+    chip->start_step = DW1000_NO_ANSWER;
     chip->is_listening = false;
     chip->hardware->set_spi_fast(false);
     if (!is_there(chip)) {
@@ -644,7 +650,12 @@ uint32_t dw1000_poll(struct dw1000 *chip)
     }
     if ((seen & CLKPLL_LL) != 0u) {
         events = DW1000_CLOCK_SLIPPED;
+        chip->clock_slips++;
         clear_status(chip, CLKPLL_LL); /* alone: a frame may be coming in */
+    }
+    if ((seen & RFPLL_LL) != 0u) {
+        chip->carrier_slips++;
+        clear_status(chip, RFPLL_LL);
     }
     if (chip->state == DW1000_SENDING) {
         events |= ((seen & TXFRS) != 0u) ? finish_sending(chip) : 0u;
@@ -664,6 +675,32 @@ bool dw1000_check(struct dw1000 *chip)
         chip->is_listening = false;
     }
     return chip->state != DW1000_OFF;
+}
+
+uint32_t dw1000_read_times(struct dw1000 *chip, uint32_t file, uint32_t sub, const uint8_t *data, uint8_t *into,
+                           uint32_t octets, uint32_t times)
+{
+    const uint8_t *expected = (data != NULL) ? data : into;
+    uint32_t differing = 0u;
+
+    for (uint32_t time = 0u; time < times; time++) {
+        bool is_equal = true;
+
+        if (data != NULL) {
+            write_bytes(chip, file, sub, data, octets);
+        }
+
+        const uint8_t *found = read_register(chip, file, sub, octets);
+
+        if (time == 0u) {
+            (void)memcpy(into, found, octets);
+        }
+        for (uint32_t at = 0u; at < octets; at++) {
+            is_equal = is_equal && (found[at] == expected[at]);
+        }
+        differing += is_equal ? 0u : 1u;
+    }
+    return differing;
 }
 
 uint64_t dw1000_now(struct dw1000 *chip)

@@ -34,6 +34,14 @@ enum dw1000_state { DW1000_OFF, DW1000_IDLE, DW1000_LISTENING, DW1000_SENDING, D
 /* What `dw1000_transmit_at` and `dw1000_receive_at` return; the reasons have the link's numbers. */
 enum dw1000_queued { DW1000_QUEUED = 0, DW1000_LATE = 1, DW1000_BUSY = 2, DW1000_NOT_READY = 3 };
 
+/* How far `dw1000_start` came. */
+enum dw1000_start_step {
+    DW1000_STARTED,
+    DW1000_NO_ANSWER,     /* no DW1000 answered after its reset */
+    DW1000_NO_LOCK,       /* the clock's PLL did not lock */
+    DW1000_NO_FAST_ANSWER /* it did not answer at the fast SPI clock */
+};
+
 #define DW1000_NOT_MEASURED (-32768)
 #define DW1000_NO_PHASE (-1)
 #define DW1000_MIN_PSDU_BYTES 3u
@@ -67,6 +75,13 @@ struct dw1000 {
     int32_t temperature_cc;
     uint32_t millivolts;
 
+    /* Of the last start, and since */
+    enum dw1000_start_step start_step;
+    uint32_t identifier; /* as it was read last */
+    uint32_t lock_us;    /* until the clock's PLL had locked */
+    uint32_t clock_slips;   /* polls that found it losing lock */
+    uint32_t carrier_slips; /* the same of the carrier's PLL */
+
     uint32_t temperature_23; /* from the one-time programmable memory, like the next */
     uint32_t voltage_33;
 
@@ -79,7 +94,7 @@ struct dw1000 {
 void dw1000_init(struct dw1000 *chip, const struct hardware *hardware);
 
 /* Reset and configure the chip, which is woken if it sleeps; antenna delays in ticks. False where no DW1000 answers, or
- * its clock does not lock. */
+ * its clock does not lock: `start_step` says which. */
 bool dw1000_start(struct dw1000 *chip, uint32_t tx_antenna_delay, uint32_t rx_antenna_delay);
 
 /* Listen from now on; a frame that waits to be sent is sent before. */
@@ -117,6 +132,14 @@ uint64_t dw1000_now(struct dw1000 *chip);
 
 /* Measure temperature and supply in some 1.1 ms, in which nothing is received; false where it cannot. */
 bool dw1000_measure(struct dw1000 *chip);
+
+/* Read a register several times, after writing `data` to it each time unless that is NULL. The first reading is in `into`;
+ * returns how many readings differ from `data`, or from the first. */
+uint32_t dw1000_read_times(struct dw1000 *chip, uint32_t file, uint32_t sub, const uint8_t *data, uint8_t *into,
+                           uint32_t octets, uint32_t times);
+
+/* A word of the one-time programmable memory. */
+uint32_t dw1000_read_otp(struct dw1000 *chip, uint32_t address);
 
 /* From one reading of the counter to another in 65536 ticks (1.026 us), negative if it was before; at most 8.6 s. */
 int32_t dw1000_micros_until(uint64_t now_ticks, uint64_t then_ticks);

@@ -17,6 +17,7 @@
 #define RXOVRR (1ull << 20)
 #define RXPTO (1ull << 21)
 #define SLP2INIT (1ull << 23)
+#define RFPLL_LL (1ull << 24)
 #define CLKPLL_LL (1ull << 25)
 #define RXSFDTO (1ull << 26)
 #define HPDWARN (1ull << 27)
@@ -62,7 +63,8 @@
 /* Waits */
 #define RESET_US 5000u /* until the chip is in INIT (data sheet 5.6: some 3 ms) */
 #define LDE_LOAD_US 300u /* it takes 150 us (UM 2.5.5.10, Table 4) */
-#define LOCK_TRIES 50u /* of 100 us */
+#define LOCK_TRIES 50u
+#define LOCK_TRY_US 100u
 #define LDE_TRIES 10u /* of 20 us */
 
 /* The accumulator (UM 7.2.38) */

@@ -13,6 +13,19 @@
 
 #define KEPT_BYTES 80u /* of settings, in flash */
 
+/* What `probe` returns. */
+enum probe {
+    PROBE_PART, /* and the next two: as the processor identifies itself */
+    PROBE_VARIANT,
+    PROBE_REVISION,
+    PROBE_RESET_PIN, /* the first of the two registers that choose it */
+    PROBE_DEBUG_LOCK,
+    PROBE_STACK_BYTES,
+    PROBE_STACK_USED, /* at most, since power-on */
+    PROBE_FACTS,      /* how many of those above */
+    PROBE_SLOW_COUNT = PROBE_FACTS /* periods of the slow crystal, modulo 2^24; 0 while it does not run */
+};
+
 /* Only `transfer`, `pause_us`, `restart_line`, `set_rate`, `sleep_for` and `write_settings` wait. The driver of the DW1000
  * uses the first four functions only. */
 struct hardware {
@@ -44,6 +57,8 @@ struct hardware {
     void (*read_settings)(uint8_t *into);
     /* Keep settings when the supply fails; nothing else happens for 90 ms. */
     void (*write_settings)(const uint8_t *from);
+    /* A fact of the processor. */
+    uint32_t (*probe)(enum probe item);
     /* Begin to send a Bluetooth advertisement of up to 31 bytes; false while the last is on its way. */
     bool (*advertise)(const uint8_t *data, uint32_t size);
 };

@@ -18,7 +18,7 @@ from skyless.core.air.frame import Reception, Transmission
 from skyless.core.errors import SkylessError
 from skyless.core.ticks import TICK_S, difference, from_seconds, wrap
 from skyless.radio.interface import AntennaDelays, Gone, Hint, Late, Listener, RadioEvent, Restarted, Sent, ignore
-from skyless.radio.serial.link import cycles, from_steps
+from skyless.radio.serial.link import cycles, from_steps, start_failure
 
 # The DW1000's driver, as the computer at its bus calls it: the C of the firmware in ``c/``, integers only.
 #
@@ -59,8 +59,6 @@ MIN_PSDU_BYTES: Final = 3
 MAX_PSDU_BYTES: Final = 127
 """Including the FCS, which the chip generates and checks (UM p. 80)."""
 MAX_TRANSFER_BYTES: Final = 132
-_DEVICE_ID_READ: Final = 0x00
-_CPLOCK: Final = 1 << 1
 
 Value = TypeVar("Value")
 
@@ -216,6 +214,8 @@ class DW1000(ctypes.Structure):
     tx_ticks: int
     temperature_cc: int
     millivolts: int
+    start_step: int
+    identifier: int
     _fields_ = (
         ("_functions", ctypes.c_void_p),
         ("state", ctypes.c_int),
@@ -229,7 +229,10 @@ class DW1000(ctypes.Structure):
         *((name, ctypes.c_int32) for name in ("rx_power_cdbm", "first_path_cdbm", "offset_ppb", "phase")),
         ("tx_ticks", ctypes.c_uint64),
         ("temperature_cc", ctypes.c_int32),
-        *((name, ctypes.c_uint32) for name in ("millivolts", "_temperature_23", "_voltage_33")),
+        ("millivolts", ctypes.c_uint32),
+        ("start_step", ctypes.c_int),
+        *((name, ctypes.c_uint32) for name in ("identifier", "_lock_us", "_clock_slips", "_carrier_slips")),
+        *((name, ctypes.c_uint32) for name in ("_temperature_23", "_voltage_33")),
         ("_status", ctypes.c_uint64),
         *((name, ctypes.c_uint8 * MAX_TRANSFER_BYTES) for name in ("_out", "_into", "_frame_into")),
     )
@@ -257,14 +260,8 @@ class DW1000(ctypes.Structure):
         Raises:
             ChipError: no DW1000 answers, or its clock does not lock.
         """
-        self._status = 0
-        if self._call("start", tx_delay_ticks, rx_delay_ticks):
-            return
-        if self._out[0] != _DEVICE_ID_READ:
-            raise ChipError("the DW1000's clock does not lock: is its crystal or supply sound?")
-        when = " at full speed" if self._status & _CPLOCK else ""
-        found = bytes(self._into[4:0:-1]).hex().upper()
-        raise ChipError(f"no DW1000{when}: its identifier is DECA0130, read was {found}")
+        if not self._call("start", tx_delay_ticks, rx_delay_ticks):
+            raise ChipError(start_failure(self.start_step, self.identifier))
 
     def receive(self) -> None:
         """Listen from now on; a queued frame is sent first."""

@@ -28,6 +28,8 @@ MODES: Final = ("radio", "tag")
 OUTPUTS: Final = ("records", "nmea", "json", "none")
 """A tag's output on its serial port."""
 ANY_SITE: Final = 0xFFFF
+BAUDS: Final = (460_800, 1_000_000, 115_200, 230_400)
+"""Rates of the serial port, in the order in which a board is looked for; a new board has the first."""
 
 _WORDS: Final = struct.Struct("<11I2i3I3f")
 SETTINGS_BYTES: Final = _WORDS.size + 2
@@ -41,7 +43,7 @@ class BoardSettings(Struct, frozen=True):
     output: int = 0
     rate_hz: int = 10
     """Highest rate of its output; 0 for every fix."""
-    baud: int = 1_000_000
+    baud: int = BAUDS[0]
     bluetooth_ms: int = 0
     """Interval of the Bluetooth advertisements; 0 for none."""
     site: int = ANY_SITE
@@ -81,7 +83,7 @@ def unpack(data: bytes) -> BoardSettings | None:
 
 MAJOR: Final = 1
 """Ends with different major versions are incompatible."""
-MINOR: Final = 3
+MINOR: Final = 4
 """Grows with appended fields and new kinds, which older ends ignore."""
 
 # From the board
@@ -97,6 +99,8 @@ TAG_STATUS: Final = 0x09
 ANCHOR_PLACE: Final = 0x0A
 GEOREFERENCE: Final = 0x0B
 TAG_CONFIG: Final = 0x0C
+VALUE: Final = 0x0D
+TEST: Final = 0x0E
 
 # From the host
 ASK_HELLO: Final = 0x41
@@ -107,6 +111,23 @@ ASK_STATUS: Final = 0x45
 SET_TAG_CONFIG: Final = 0x46
 ASK_TAG_CONFIG: Final = 0x47
 SET_TIME: Final = 0x48
+READ: Final = 0x49
+TEST_LINE: Final = 0x4A
+
+OTP: Final = 0x40
+FACTS: Final = 0x80
+CLOCKS: Final = 0x81
+COUNTS: Final = 0x82
+"""What READ reads besides register files of the chip, which are below ``OTP``: a word of the chip's one-time
+programmable memory, facts of the processor, three clocks at once, and counts since the start."""
+READ_BYTES: Final = 16
+READ_TIMES: Final = 1000
+"""The most of a register that READ reads, and the most often."""
+READ_DATA_AT: Final = 9
+READ_SLOWLY: Final = 0x01
+"""Flag in READ: at the slow SPI clock."""
+TEST_OVERHEAD: Final = 6
+"""Bytes of a record on the line besides its body."""
 
 RX_FRAME_AT: Final = 13
 RX_PHASE_FRAME_AT: Final = 15
@@ -155,6 +176,9 @@ REFUSED_SETTING: Final = 1
 REFUSED_MALFORMED: Final = 2
 REFUSED_RADIO: Final = 3
 """Why a command was refused."""
+
+STATUS_OCTETS: Final = 5
+"""Of the chip's SYS_STATUS in REFUSED."""
 
 RATE_KHZ: Final = 63_897_600
 COUNTER_BITS: Final = 40
@@ -323,6 +347,9 @@ _STEPS: Final = (100, 100, 1000)
 """Units of powers and carrier offset: steps per dB and per ppm."""
 _GREATEST: Final = 0x7FFF
 _TURN: Final = 1 << 16
+DEVICE_ID: Final = 0xDECA0130
+_NO_LOCK: Final = 2
+_NO_FAST_ANSWER: Final = 3
 
 
 class Hello(Struct, frozen=True):
@@ -387,6 +414,26 @@ class NotDone(Struct, frozen=True):
 
     command: int
     reason: int
+    start_step: int | None = None
+    """How far the chip's start came (``dw1000.h``); None where it started, or for a board of version 1.3."""
+    identifier: int = 0
+    """Of the chip, as it was read last."""
+
+
+class Value(Struct, frozen=True):
+    """What READ has read."""
+
+    file: int
+    sub: int
+    differing: int
+    """Readings that differed from the first, or from what was written."""
+    data: bytes
+
+
+class Test(Struct, frozen=True):
+    """A record that tests the line; ``length`` as it was on the line."""
+
+    length: int
 
 
 class TagConfig(Struct, frozen=True):
@@ -396,7 +443,7 @@ class TagConfig(Struct, frozen=True):
     in_flash: bool
 
 
-Record = Hello | Heard | Done | TooLate | Status | NotDone | TagConfig | TagReport
+Record = Hello | Heard | Done | TooLate | Status | NotDone | Value | Test | TagConfig | TagReport
 
 
 def decode(record: bytes) -> Record | str:
@@ -407,6 +454,14 @@ def decode(record: bytes) -> Record | str:
         return _DECODERS[record[0]](record) or "malformed-record"
     except (struct.error, IndexError):
         return "malformed-record"  # it is too short
+
+
+def start_failure(step: int, identifier: int) -> str:
+    """Why a DW1000 did not start, in words: ``start_step`` of ``dw1000.h``, and the identifier that was read last."""
+    if step == _NO_LOCK:
+        return "the DW1000's clock does not lock: is its crystal or supply sound?"
+    when = " at full speed" if step == _NO_FAST_ANSWER else ""
+    return f"no DW1000{when}: its identifier is {DEVICE_ID:08X}, read was {identifier:08X}"
 
 
 def to_steps(measured: Diagnostics) -> tuple[int, int, int]:
@@ -490,6 +545,17 @@ def _status(record: bytes) -> Status:
     )
 
 
+def _refused(record: bytes) -> NotDone:
+    if record[2] == CONFIG and record[3] == REFUSED_RADIO and len(record) >= BODY_AT + 2 + 5:
+        return NotDone(record[2], record[3], *struct.unpack_from("<BI", record, 4))
+    return NotDone(record[2], record[3])
+
+
+def _read_value(record: bytes) -> Value:
+    file, sub, differing = struct.unpack_from("<BHH", record, BODY_AT)
+    return Value(file, sub, differing, record[BODY_AT + 5 :])
+
+
 def _tag_config(record: bytes) -> TagConfig | None:
     settings = unpack(record[SETTINGS_AT:])
     return None if settings is None else TagConfig(settings, bool(record[BODY_AT] & IN_FLASH))
@@ -501,11 +567,13 @@ _DECODERS: Final[dict[int, Callable[[bytes], Record | None]]] = {
     TX_DONE: _done,
     TX_LATE: lambda record: TooLate(_ticks(record), record[7]),
     STATUS: _status,
-    REFUSED: lambda record: NotDone(record[2], record[3]),
+    REFUSED: _refused,
     RX_PHASE: _heard_with_phase,
     FIX: board_fix,
     TAG_STATUS: board_status,
     ANCHOR_PLACE: anchor_place,
     GEOREFERENCE: georeference,
     TAG_CONFIG: _tag_config,
+    VALUE: _read_value,
+    TEST: lambda record: Test(len(record) - BODY_AT + TEST_OVERHEAD),
 }

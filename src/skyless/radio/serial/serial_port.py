@@ -57,7 +57,9 @@ class SerialPort:
             else:
                 self._connection = connection
                 try:
-                    self._report(await connection.ended or f"{self.path} was unplugged")
+                    ended = await connection.ended
+                    if ended is not None:
+                        self._report(ended or f"{self.path} was unplugged")
                 finally:
                     self._connection = None
                     user.on_close()
@@ -81,8 +83,8 @@ class SerialPort:
         """Bytes not accepted by the port yet; 0 while it is closed."""
         return 0 if self._connection is None else self._connection.waiting_bytes()
 
-    def reopen(self, reason: str) -> None:
-        """Close the port, if open, and open it again."""
+    def reopen(self, reason: str | None) -> None:
+        """Close the port, if open, and open it again; None: nobody needs to know why."""
         if self._connection is not None:
             self._connection.end(reason)
 
@@ -98,12 +100,12 @@ class SerialPort:
 
 
 class _Connection(asyncio.Protocol):
-    """The port from opening to closing; ``ended`` gives the reason, empty if unknown."""
+    """The port from opening to closing; ``ended`` gives the reason, empty if unknown, None if it is of no interest."""
 
     def __init__(self, user: PortUser) -> None:
         self._user = user
         self.waiting_bytes: Callable[[], int] = int
-        self.ended: asyncio.Future[str] = asyncio.get_running_loop().create_future()
+        self.ended: asyncio.Future[str | None] = asyncio.get_running_loop().create_future()
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         assert isinstance(transport, asyncio.WriteTransport)
@@ -122,7 +124,7 @@ class _Connection(asyncio.Protocol):
     def connection_lost(self, exc: Exception | None) -> None:  # noqa: ARG002 - the reason makes no difference
         self.end("")
 
-    def end(self, reason: str) -> None:
+    def end(self, reason: str | None) -> None:
         if not self.ended.done():
             self.ended.set_result(reason)
 

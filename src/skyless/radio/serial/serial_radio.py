@@ -12,9 +12,21 @@ from msgspec.structs import replace
 from skyless.core.air.frame import Reception, Transmission
 from skyless.core.errors import SkylessError
 from skyless.core.ticks import wrap
-from skyless.radio.interface import AntennaDelays, Gone, Hint, Late, Listener, RadioEvent, Restarted, Sent, ignore
+from skyless.radio.interface import (
+    NOTABLE_SHARE,
+    AntennaDelays,
+    Gone,
+    Hint,
+    Late,
+    Listener,
+    RadioEvent,
+    Restarted,
+    Sent,
+    ignore,
+)
 from skyless.radio.serial import link
 from skyless.radio.serial.link import (
+    BAUDS,
     MODES,
     OUTPUTS,
     Done,
@@ -24,9 +36,12 @@ from skyless.radio.serial.link import (
     Record,
     Status,
     TagConfig,
+    Test,
     TooLate,
+    Value,
     decode,
     pack,
+    start_failure,
 )
 from skyless.radio.serial.serial_port import BoardClock, SerialPort
 from skyless.radio.tag_reports import Reported
@@ -46,10 +61,17 @@ _MAX_STARTS: Final = 3
 _MAX_STARTS_S: Final = 60.0
 """A board that starts as often within this time does so unintentionally."""
 
-_LEAD_S: Final = 5.0e-3
-"""A command of 112 bytes on the line (1.1 ms), the lag of the estimate of the board's counter, which is the shortest
-transfer of a record (1.2 ms), the board (0.3 ms), and a USB bridge that passes on 64 bytes in a millisecond; without
-such a bridge 2.5 ms would do (``benchmarks/firmware.py site``)."""
+_LEAD_S: Final = 2.7e-3
+_LEAD_BITS: Final = 2300
+"""The board (0.3 ms) and a USB bridge that passes on 64 bytes in a millisecond; and on the line a command of 112 bytes,
+and a record of 117, whose transfer the estimate of the board's counter lags: 5 ms at 1 Mbaud. Without such a bridge
+half of it would do (``benchmarks/firmware.py site``)."""
+
+_LINE_S: Final = 10.0
+"""The line is judged by the records of this time, and from this number of spoilt ones on."""
+_MIN_SPOILT: Final = 3
+SPOILT_SHARE: Final = 0.1
+"""From this share of spoilt records on a line is as good as none; from ``NOTABLE_SHARE`` on it is reported."""
 
 _REASONS: Final = {
     link.REFUSED_SETTING: "it has not these settings",
@@ -76,6 +98,32 @@ class Computing(Struct, frozen=True):
 
 UNTIL_NEXT_START: Final = Computing({"mode": MODES.index("tag"), "output": OUTPUTS.index("records")}, keeps=False)
 """A tag that sends records to its host, until its next start."""
+
+
+class LineQuality:
+    """Shares of spoilt records on the line from a board."""
+
+    def __init__(self) -> None:
+        self.sound = self.spoilt = 0
+        """Records since the session's begin."""
+        self._before: deque[tuple[int, int]] = deque([(0, 0)], maxlen=round(_LINE_S / STATUS_S))
+        self._reported = 0.0
+
+    def worse_share(self) -> float | None:
+        """The share of the last seconds, if it should be reported: it is bad, and so bad for the first time."""
+        sound, spoilt = self.sound - self._before[0][0], self.spoilt - self._before[0][1]
+        self._before.append((self.sound, self.spoilt))
+        share = spoilt / max(sound + spoilt, 1)
+        level = max((limit for limit in (NOTABLE_SHARE, SPOILT_SHARE) if share >= limit), default=0.0)
+        if spoilt < _MIN_SPOILT or level <= self._reported:
+            return None
+        self._reported = level
+        return share
+
+    @property
+    def share(self) -> float:
+        """The share since the session's begin."""
+        return self.spoilt / max(self.sound + self.spoilt, 1)
 
 
 class LinkSession:
@@ -105,6 +153,7 @@ class LinkSession:
         self.tag_config: TagConfig | None = None
         """The last stated settings of a board that computes."""
         self.counters = counters
+        self.line = LineQuality()
         self._port, self._delays, self._send, self._listener = port, delays, send, listener
         self._transmits, self._phases, self._computing = transmits, phases, computing
         self._reader, self._writer = link.Reader(), link.Writer()
@@ -125,10 +174,16 @@ class LinkSession:
         self._send(b"\0")
         self._ask_hello(host_s)
 
-    def poll(self, host_s: float) -> str | None:
-        """Call every ``STATUS_S``. Returns the reason to reopen the port, or None."""
-        if host_s - self._heard_s > BOARD_SILENCE_S:
+    def poll(self, host_s: float, unheard_s: float = BOARD_SILENCE_S) -> str | None:
+        """Call every ``STATUS_S``. Returns the reason to reopen the port, or None.
+
+        ``unheard_s``: how long to wait for a board that was never heard.
+        """
+        if host_s - self._heard_s > (BOARD_SILENCE_S if self.line.sound else unheard_s):
             return self._reason_of_silence()
+        share = self.line.worse_share()
+        if share is not None:
+            self._listener(Hint(spoilt_line(self._port, share)))
         if self.hello is None or self._refused:
             self._ask_hello(host_s)
         elif self.ready:
@@ -149,6 +204,8 @@ class LinkSession:
     def _reason_of_silence(self) -> str:
         if self.hello is not None:
             return f"the board at {self._port} has stopped answering"
+        if self.line.sound:
+            return f"the board at {self._port} sends records, but does not answer: does it get what is sent to it?"
         if self._bytes:
             return f"what comes from {self._port} is no serial link of Skyless ({self._bytes} bytes); wrong baud rate?"
         return f"no board answers at {self._port}"
@@ -167,11 +224,15 @@ class LinkSession:
     def on_data(self, data: bytes, host_s: float) -> None:
         """Process bytes from the port."""
         self._bytes += len(data)
-        reader = self._reader
-        before = reader.garbled + reader.overlong
+        reader, line = self._reader, self.line
+        before, spoilt = reader.garbled + reader.overlong, line.spoilt
         for record in reader.read(data):
+            line.sound += 1
             self._on_record(record, host_s)
-        self._count("garbled-record", reader.garbled + reader.overlong - before)
+        garbled = reader.garbled + reader.overlong - before
+        self._count("garbled-record", garbled)
+        if self.hello is None:  # later their numbers show all that are missing
+            line.spoilt = spoilt + garbled
 
     def _on_record(self, raw: bytes, host_s: float) -> None:
         record = decode(raw)
@@ -195,6 +256,7 @@ class LinkSession:
             return False
         self._expected = (number + 1) & 0xFF
         self._count("lost-record", missing)
+        self.line.spoilt += missing
         return True
 
     def _count(self, reason: str, times: int) -> None:
@@ -220,8 +282,8 @@ class LinkSession:
             self._on_hello(record, host_s)
         elif isinstance(record, NotDone):
             self._on_refusal(record)
-        elif self._computing is None:
-            pass  # of a tag
+        elif self._computing is None or isinstance(record, Value | Test):
+            pass  # of a tag, or for skyless selftest
         elif isinstance(record, TagConfig):
             self._on_tag_config(record, self._computing)
         elif self.ready:
@@ -293,6 +355,8 @@ class LinkSession:
         """A board that refuses its configuration is unusable; other refusals are counted."""
         if refusal.command in (link.CONFIG, link.SET_TAG_CONFIG):
             why = _REASONS.get(refusal.reason, f"reason {refusal.reason}")
+            if refusal.start_step is not None:
+                why = start_failure(refusal.start_step, refusal.identifier)
             self._refuse(f"the board at {self._port} refuses its configuration: {why}")
         else:
             self.counters["refused-command"] += 1
@@ -364,6 +428,14 @@ class LinkSession:
         self.clock.reset()
 
 
+def spoilt_line(port: str, share: float) -> str:
+    """What to do about a line that spoils this share of the records."""
+    return (
+        f"{100 * share:.0f} % of what the board at {port} says is spoilt on the line: try another cable or hub, or a "
+        f"lower rate (skyless flash-config --baud {BAUDS[0]})"
+    )
+
+
 def _last_cause(cause: int | None) -> str:
     """Cause of a board's start, for a message; empty if not stated."""
     if cause is None:
@@ -380,7 +452,7 @@ class SerialRadio:
     def __init__(
         self,
         path: str,
-        baud: int,
+        bauds: Sequence[int],
         name: str,
         delays: AntennaDelays | None = None,
         *,
@@ -388,13 +460,15 @@ class SerialRadio:
         phases: bool = False,
         computing: Computing | None = None,
     ) -> None:
-        """``transmits``, ``phases`` and ``computing`` as in ``LinkSession``."""
+        """``bauds``: rates at which the board is looked for; the flags are those of ``LinkSession``."""
         self.name = name
         self.counters: Counter[str] = Counter()
-        self.lead_s = _LEAD_S
+        self.lead_s = _LEAD_S + _LEAD_BITS / bauds[0]
+        self._bauds = deque(bauds)
+        self._untried = len(bauds)
         self._delays = AntennaDelays() if delays is None else delays
         self._transmits, self._phases, self._computing = transmits, phases, computing
-        self._port = SerialPort(path, baud, lambda reason: self._listener(Gone(reason)))
+        self._port = SerialPort(path, bauds[0], lambda reason: self._listener(Gone(reason)))
         self._listener: Listener = ignore
         self._session: LinkSession | None = None
 
@@ -407,6 +481,11 @@ class SerialRadio:
     def tag_config(self) -> TagConfig | None:
         """Settings of a board that computes; None before it has stated them."""
         return None if self._session is None else self._session.tag_config
+
+    @property
+    def spoilt_share(self) -> float:
+        """Share of the board's records that were spoilt on the line."""
+        return 0.0 if self._session is None else self._session.line.share
 
     async def run(self, listener: Listener) -> None:
         """Receive until cancelled; an unplugged board is searched for."""
@@ -444,9 +523,18 @@ class SerialRadio:
         while True:
             await asyncio.sleep(STATUS_S)
             if self._session is not None:
-                reason = self._session.poll(time.monotonic())
+                reason = self._session.poll(time.monotonic(), BOARD_SILENCE_S / len(self._bauds))
                 if reason is not None:
-                    self._port.reopen(reason)
+                    self._port.reopen(reason if self._try_next_rate(self._session) else None)
+
+    def _try_next_rate(self, session: LinkSession) -> bool:
+        """Go to the next rate, unless the board was heard at this one. Returns whether all have been tried."""
+        if session.line.sound:
+            return True
+        self._bauds.rotate(-1)
+        self._port.baud = self._bauds[0]
+        self._untried = self._untried - 1 or len(self._bauds)
+        return self._untried == len(self._bauds)
 
     # What the port calls
 
@@ -476,9 +564,6 @@ class SerialRadio:
 
 # Asks a board for its settings and changes them, at whatever rate its port works.
 
-_ANSWER_S: Final = 1.5
-"""A board answers within milliseconds, even if it has to erase a page of its flash."""
-
 
 async def set_up(path: str, bauds: Sequence[int], computing: Computing) -> TagConfig:
     """Return the settings of the board at a port, after the requested changes, if any.
@@ -486,19 +571,16 @@ async def set_up(path: str, bauds: Sequence[int], computing: Computing) -> TagCo
     Raises:
         SkylessError: the port cannot be opened, no board answers, or it computes no positions or refuses.
     """
-    for baud in bauds:
-        radio, events = SerialRadio(path, baud, "", computing=computing), asyncio.Queue[RadioEvent]()
-        running = asyncio.ensure_future(radio.run(events.put_nowait))
-        try:
-            event = await asyncio.wait_for(events.get(), _ANSWER_S)
-        except TimeoutError:
-            continue
-        finally:
-            config = radio.tag_config
-            running.cancel()
-            await asyncio.gather(running, return_exceptions=True)
-        if isinstance(event, Gone) or config is None:
-            raise SkylessError(event.reason if isinstance(event, Gone) else f"the board at {path} says no settings")
-        return config
-    rates = ", ".join(map(str, bauds))
-    raise SkylessError(f"no board of Skyless answers at {path}, at {rates} baud: another port, or other firmware?")
+    radio, events = SerialRadio(path, bauds, "", computing=computing), asyncio.Queue[RadioEvent]()
+    running = asyncio.ensure_future(radio.run(events.put_nowait))
+    try:
+        event = await events.get()
+    finally:
+        config = radio.tag_config
+        running.cancel()
+        await asyncio.gather(running, return_exceptions=True)
+    if isinstance(event, Gone):
+        raise SkylessError(f"{event.reason} ({', '.join(map(str, bauds))} baud were tried)")
+    if config is None:
+        raise SkylessError(f"the board at {path} says no settings")
+    return config
