@@ -1,6 +1,7 @@
 """``skyless site new`` and ``skyless site check``, called as the program calls them."""
 
 import json
+import math
 import os
 
 import pytest
@@ -86,6 +87,7 @@ OUT_OF_RANGE = ("--width 0", "--width nan", "--anchor-count 0", "--anchor-count 
         (["--width", "9", "--depth", "9", "--spacing", "3", "--anchor-count", "5"], "a grid needs"),
         (["--width", "10000", "--depth", "10000", "--spacing", "15"], "444889 anchors are too many"),
         (["--width", "3", "--depth", "3", "--tag-height", "nan"], "--tag-height is 'nan'; it should be metres or free"),
+        (["--unplaced", "200", "--board", "dwm1001-dev"], "its line carries 156 anchors in view, not 200"),
         (["--width", "0.001", "--depth", "0.001"], "--width is 0.001; it should be a number, at least 0.1"),
         (["--width", "3", "--depth", "0.09"], "--depth is 0.09; it should be a number, at least 0.1"),
         *(([*["--width", "3", "--depth", "3"], *two.split()], two.split()[0]) for two in OUT_OF_RANGE),
@@ -129,3 +131,29 @@ def test_new_writes_anchors_without_positions(tmp_path, complaint):
     assert "--unplaced is 7; it takes no sizes" in complaint(
         "site", "new", path, "--unplaced", "7", "--width", "3", "--force"
     )
+
+
+HALF_A_LINE = 457_143 / 10 / 2  # bytes a second: 460,800 baud as an nRF52832 makes it
+
+
+@pytest.mark.parametrize("phases", [[], ["--phases"]])
+@pytest.mark.parametrize("anchors", [1, 2, 3, 6, 8, 9, 20, 57, 156])
+def test_for_a_dwm1001_dev_all_anchors_together_fill_at_most_half_of_its_line(tmp_path, phases, anchors):
+    path = tmp_path / "site.toml"
+    assert main(["site", "new", str(path), "--unplaced", str(anchors), "--board", "dwm1001-dev", *phases]) == 0
+    rate_hz = load_site(path).schedule.rate_hz
+    used = anchors * rate_hz * (19 + min(63 + 8 * (anchors - 1), 127))  # docs/serial.md, docs/protocol2.md
+    assert used <= HALF_A_LINE
+    assert rate_hz == 66.6 or used > HALF_A_LINE - 0.1 * anchors * 146  # as many as fit, in steps of 0.1 Hz
+    assert "half full at most, with all anchors in view: a DWM1001-DEV's" in path.read_text()
+
+
+def test_for_a_dwm1001_dev_slots_are_longer_and_a_halls_far_anchors_do_not_count(tmp_path):
+    path = tmp_path / "site.toml"
+    new = ["site", "new", str(path), "--board", "dwm1001-dev", "--force"]
+    assert main([*new, "--paper"]) == 0
+    assert 146 / load_site(path).schedule.slot_s <= HALF_A_LINE < 146 / (load_site(path).schedule.slot_s - 1e-4)
+    assert main([*new, "--width", "200", "--depth", "200", "--spacing", "12"]) == 0
+    points = [(anchor.x_m, anchor.y_m) for anchor in load_site(path).anchors]
+    in_view = max(sum(math.dist(at, point) < 31.0 for point in points) for at in points)
+    assert in_view * load_site(path).schedule.rate_hz * 146 <= HALF_A_LINE

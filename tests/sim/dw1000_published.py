@@ -150,3 +150,23 @@ DEVICE_ID = 0xDECA0130
 OTP = {"LDOTUNE": 0x04, "PART_ID": 0x06, "LOT_ID": 0x07, "VOLTAGE": 0x08, "TEMPERATURE": 0x09, "CRYSTAL_TRIM": 0x1E}
 RESETS = {"ALL": 0x00, "RX": 0xE0, "NONE": 0xF0}  # octet 3 of PMSC_CTRL0
 POWER_A_DB = 121.74  # PRF 64
+
+# What two drivers, which have run on many boards, write before they receive and send (channel 5, PRF 64 MHz, code 9,
+# 6.8 Mbit/s, 128 symbols): file:sub and the value, whose digits say how many octets. Read on 30 November 2026.
+WRITTEN = {
+    # Decawave/uwb-dw1000 (Mynewt; DWM1001-DEV), dw1000_phy.c at 861c51a2, dw1000_mac.c at 46fc9d69, dw1000_regs.h at
+    # 7ecee2ff: AGC_TUNE3 stays unset, and a transmission is begun and aborted
+    "uwb-dw1000": """
+        36:00 01  24:00 04  2B:0E 71  36:00 01  36:01 03  2D:06 8000  36:00 00  2A:0B C0  04:00 00001200  2E:2804 28F4
+        2E:0806 6D  2E:1806 0607  2B:07 0800041D  2B:0B BE  28:0B D8  28:0C 001E3FE3  27:02 0001  27:04 008D  27:06 0020
+        27:26 0028  27:08 313B006B  27:20 0081  23:0C 2502A907  23:04 889B  1F:00 4A480055  08:00 00164000  0D:00 42
+    """,
+    # thotro/arduino-dw1000, src/DW1000.cpp at 03efdc67, and after it Bitcraze's libdw1000, at 0ab038d1: FS_PLLTUNE of
+    # an older manual
+    "arduino-dw1000": """
+        0D:00 00000040  36:00 F0300301  2D:06 8000  36:00 F0300200  03:00 000A0006  04:00 20001200  1F:00 4A480055
+        08:00 000016400C  0E:00 00026080  23:04 889B  23:0C 2502A907  23:12 0035  27:02 0001  27:04 008D  27:06 0020
+        27:08 313B006B  27:26 0028  2E:0806 0D  2E:1806 0607  2E:2804 28F4  1E:00 25456585  28:0B D8  28:0C 001E3FE0
+        2A:0B C0  2B:0B A6  2B:07 0800041D  18:00 4000  2E:1804 4000
+    """,
+}

@@ -4,6 +4,7 @@ import cmath
 import math
 import struct
 
+import dw1000_published as published
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -12,8 +13,8 @@ from skyless.core.air.frame import Diagnostics, after_rmarker_s, fcs, preamble_s
 from skyless.core.ticks import TICK_RATE_HZ, wrap
 from skyless.sim.dw1000 import registers as r
 from skyless.sim.dw1000.chip import Chip, Sensors
-from skyless.sim.dw1000.registers import Access, decode_header
-from skyless.sim.dw1000.transceiver import HZ_PER_STEP, TUNED_TO_RECEIVE, TUNED_TO_SEND
+from skyless.sim.dw1000.registers import Access, Register, decode_header
+from skyless.sim.dw1000.transceiver import AGC_LOSS_DB, HZ_PER_STEP, TUNED_TO_RECEIVE, TUNED_TO_SEND
 
 TX_DELAY, RX_DELAY = 16_000, 17_000
 SLOW, FAST = 3_000_000, 20_000_000
@@ -331,6 +332,40 @@ def test_with_another_setting_it_hears_nothing_and_is_not_heard(bench, register,
     bench.write(r.SYS_CTRL, r.TRXOFF)
     bench.send(2e-3)
     assert len(bench.sent) == (why in ("rate", "prf") or register is r.DRX_TUNE2)  # these concern the receiver alone
+
+
+@pytest.mark.parametrize("driver", published.WRITTEN)
+def test_with_what_drivers_on_real_boards_write_it_receives_and_sends(driver):
+    bench, words = Bench(), published.WRITTEN[driver].split()
+    for place, value in zip(words[::2], words[1::2], strict=True):
+        bench.now_s += 200e-6
+        file, sub = (int(part, 16) for part in place.split(":"))
+        bench.write(Register(file, sub, len(value) // 2), int(value, 16))
+    bench.listen()
+    assert bench.hear()[1] == "heard"
+    dx = bench.send(2e-3)
+    assert bench.sent == [(FRAME, wrap((dx & ~0x1FF) + TX_DELAY))]
+    assert not +bench.chip.misuse
+
+
+def test_without_agc_tune3_all_is_weaker_what_was_weak_is_lost_and_the_receiver_stays_on(bench):
+    readings = []
+    for tune, power_dbm in ((0x35, -80.0 - AGC_LOSS_DB), (0, -80.0)):
+        bench.write(r.AGC_TUNE3, tune)
+        bench.listen()
+        assert bench.hear(told=Diagnostics(power_dbm, power_dbm - 4.0, 0.0))[1] == "heard"
+        readings.append([bench.read(one) for one in (r.CIR_PWR, r.FP_AMPL1, r.RX_FINFO)])
+    assert readings[0] == readings[1]
+    bench.listen()
+    assert bench.hear(told=Diagnostics(-92.0, -93.0, 0.0))[1] == "too-weak"
+    assert bench.hear(told=Diagnostics())[1] == "heard"  # where the air knows no power
+
+
+def test_a_start_together_with_off_aborts_both_and_sends_nothing(bench):
+    """UM 5.3.1.2, as drivers cite it: it only sets the transmitter's delimiter up."""
+    bench.send(2e-3)
+    bench.write(r.SYS_CTRL, r.TXSTRT | r.TRXOFF)
+    assert (bench.withdrawn, len(bench.sent), bench.chip.transceiver.sending) == (1, 1, None)
 
 
 @pytest.mark.parametrize(

@@ -1,7 +1,9 @@
 """``skyless site``: write and check site files; for their keys see ``site_keys``."""
 
+import math
 import secrets
 import time
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any, Final, Literal
@@ -24,14 +26,16 @@ from skyless.cli.common import (
     write_file,
 )
 from skyless.cli.nodes.options import SiteId
-from skyless.core.air.almanac import OFFERED_HZ
-from skyless.core.air.frame import MAX_FRAME_BYTES, air_time_s
+from skyless.core.air.almanac import OFFERED_HZ, SHORTEST_PERIOD_S
+from skyless.core.air.beacon import HAS_AUTHENTICATION, HAS_PAGE, HAS_POSITION, bare_bytes
+from skyless.core.air.frame import HEARD_BYTES, MAX_FRAME_BYTES, air_time_s
 from skyless.core.any_receiver import beacon_period_s
 from skyless.core.errors import SkylessError
-from skyless.core.geometry import RADIO_REACH_M, anchors_in_reach
+from skyless.core.geometry import RADIO_REACH_M, anchor_positions, anchors_in_reach, pairs_within
 from skyless.core.protocol1.beacon import first_slots, schedule_of
 from skyless.core.site import FloorSite, ScheduleSite, Site
 from skyless.core.ticks import TICK_S
+from skyless.radio.serial.link import Writer
 from skyless.sim.lab import lab_site
 from skyless.site.file.check import ANY_ADDRESS, check_site
 from skyless.site.file.load import load_site
@@ -43,6 +47,9 @@ _RoomMetres = Annotated[float, number(least=0.1, most=10_000.0)]
 _GRID_HEIGHT_M: Final = 4.0
 _TAGS_BELOW_A_GRID_M: Final = 1.2
 _PAPER_SLOT_S: Final = 2.5e-3
+_LINE_BYTES_PER_S: Final = 457_143 / 10
+"""What the debugger of a DWM1001-DEV carries: 460,800 baud, of which an nRF52832 makes 457,143; 10 bits a byte."""
+_PACED: Final = "# So few beacons that a tag's line is half full at most, with all anchors in view: a DWM1001-DEV's.\n"
 _LONGEST_TABLE: Final = 40
 """Most anchors to show one per row; for more there is only a summary."""
 _Count = Annotated[int, whole(1, 255)]
@@ -75,6 +82,9 @@ class NewOptions(JsonOptions, frozen=True, kw_only=True):
     """Use the paper's protocol (mode master): the anchor that the others receive best is the master."""
     phases: bool = False
     """Let anchors relay carrier phases (DW1000), at the rate that tags in hands need to lock: as many as fit."""
+    board: Literal["dwm1001-dev"] | None = None
+    """The tags' board, if its serial port carries less than anchors send by default: they then send more rarely, and
+    with --phases tags in hands may not lock."""
     tag_height: str | None = None
     """The tags' height: metres, at which all of them move (2-D), or free, the default: estimated (3-D). With --spacing,
     whose anchors lie in one plane, the default is 1.2."""
@@ -100,8 +110,10 @@ def new(asked: NewOptions) -> None:
         if asked.paper:
             raise SkylessError("--phases needs anchors that send without a master; leave --paper out")
         site = replace(site, schedule=replace(site.schedule, carrier_phase=True))
+    if asked.board is not None:
+        site = _paced(site)
     check_site(site, file)
-    write_file(file, site_template(site).encode())
+    write_file(file, site_template(site, "" if asked.board is None else _PACED).encode())
     if asked.json:
         print_json({"file": file, "name": site.name, "id": site.id, "anchors": len(site.all_anchors)})
     else:
@@ -143,6 +155,26 @@ def _new_site(asked: NewOptions) -> Site:
 
         site = with_best_master(replace(site, schedule=ScheduleSite(slot_s=_PAPER_SLOT_S)), ChannelModel())
     return site
+
+
+def _paced(site: Site) -> Site:
+    """The site with half as many beacons as a DWM1001-DEV's line carries, or fewer. Raises SkylessError.
+
+    In view are all anchors of a room: those that a tag receives at once are within twice the reach of each other.
+    """
+    near = pairs_within(anchor_positions(site), 2.0 * RADIO_REACH_M)
+    others = Counter(row for pair in near for rows in pair[:2] for row in rows.tolist())
+    in_view = len(site.unplaced) or 1 + max(others.values(), default=0)
+    relaying = bare_bytes(HAS_POSITION | HAS_PAGE | HAS_AUTHENTICATION) + HEARD_BYTES * (in_view - 1)
+    frame = bytes(MAX_FRAME_BYTES if site.schedule.needs_master else min(relaying, MAX_FRAME_BYTES))
+    beacons_per_s = 0.5 * _LINE_BYTES_PER_S / len(Writer().rx(0, 0, 0, 0, frame, phase=0))  # tags ask for phases
+    if site.schedule.needs_master:
+        return replace(site, schedule=replace(site.schedule, slot_s=math.ceil(1e4 / beacons_per_s) / 1e4))
+    if in_view > beacons_per_s:
+        most = int(beacons_per_s)
+        raise SkylessError(f"--board is dwm1001-dev; its line carries {most} anchors in view, not {in_view}")
+    rate_hz = math.floor(10.0 * min(beacons_per_s / in_view, 1.0 / SHORTEST_PERIOD_S)) / 10.0
+    return replace(site, schedule=replace(site.schedule, rate_hz=rate_hz))
 
 
 def _check_free(file: Path, *, force: bool) -> None:

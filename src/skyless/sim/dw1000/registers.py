@@ -24,7 +24,7 @@ class Register(Struct, frozen=True):
 
 # Identity and configuration (UM 7.2.2 to 7.2.14)
 DEV_ID: Final = Register(0x00, 0x00, 4, 0xDECA0130, "RO")  # 7.2.2
-PANADR: Final = Register(0x03, 0x00, 4, 0xFFFFFFFF)  # 7.2.5
+PANADR: Final = Register(0x03, 0x00, 4, 0xFFFFFFFF)  # 7.2.5, of the frame filter
 SYS_CFG: Final = Register(0x04, 0x00, 4, 0x00001200)  # 7.2.6
 SYS_TIME: Final = Register(0x06, 0x00, 5, 0, "RO")  # 7.2.8
 TX_FCTRL: Final = Register(0x08, 0x00, 5, 0x0015400C)  # 7.2.10, pp. 73-77

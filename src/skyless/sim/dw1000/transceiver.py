@@ -27,6 +27,7 @@ from skyless.core.air.frame import (
 from skyless.core.ticks import CHANNEL_5_HZ, CHIP_RATE_HZ, DELAYED_TX_GRANULARITY_TICKS, difference, from_seconds, wrap
 from skyless.sim.dw1000 import registers as r
 from skyless.sim.dw1000.registers import Memory
+from skyless.site.channel import ChannelModel
 
 DX_MASK: Final = ~(DELAYED_TX_GRANULARITY_TICKS - 1)
 PREAMBLE_TICKS: Final = from_seconds(preamble_s())
@@ -52,6 +53,8 @@ _MISSABLE_TICKS: Final = from_seconds((128 - _NEEDED_SYMBOLS) * PREAMBLE_SYMBOL_
 _SUSPECT_TICKS: Final = 1024
 """Error of the stamp after an error without a receiver reset (assumed; UM 4.1.6 only warns of it)."""
 
+AGC_LOSS_DB: Final = 3.0
+"""How much weaker all is received unless AGC_TUNE3 is set (assumed); what is then below the sensitivity is lost."""
 PRF_64_DB: Final = 121.74
 """The constant of both powers at 64 MHz PRF (UM 4.7.1, 4.7.2)."""
 _ACCUMULATED_SYMBOLS: Final = 118
@@ -148,6 +151,7 @@ class Transceiver:
         """Execute a write to SYS_CTRL."""
         if control & r.TRXOFF:
             self.off()
+            control &= ~r.TXSTRT  # begun and aborted at once, which sets the delimiter up; nothing is sent (UM 5.3.1.2)
         if control & r.HRBPT:
             self._host_buffer ^= 1
             self._exchange_buffers()
@@ -301,6 +305,14 @@ class Transceiver:
         """
         memory = self._memory
         reason = self._why_not_received(antenna_ticks)
+        if memory.get(r.AGC_TUNE3) != TUNED_TO_RECEIVE["AGC_TUNE3"]:
+            power_dbm, first_dbm = (
+                None if power is None else power - AGC_LOSS_DB
+                for power in (diagnostics.rx_power_dbm, diagnostics.first_path_power_dbm)
+            )
+            diagnostics = Diagnostics(power_dbm, first_dbm, diagnostics.carrier_offset_ppm)
+            if power_dbm is not None and power_dbm < ChannelModel().sensitivity_dbm:
+                reason = reason or "too-weak"
         if reason is not None:
             return reason
         if fault in ("header", "parity", "delimiter"):
@@ -417,7 +429,7 @@ def _first_path(power_dbm: float | None, symbols: int) -> tuple[int, int, int]:
 
 # Settings: channel 5, PRF 64 MHz, 6.8 Mbit/s, a preamble of 128 symbols, code 9. A chip with others receives nothing
 # and is not received. Tuning registers count, too: a wrong value in a driver has to show, although a real receiver
-# would still receive something.
+# would still receive something. AGC_TUNE3 only weakens reception, for drivers of real boards leave it unset.
 
 _CHANNEL: Final = 5
 _CODE: Final = 9
@@ -450,6 +462,13 @@ TUNED_TO_SEND: Final[dict[str, int]] = {
     "FS_PLLTUNE": 0xBE,
 }
 
+_ALSO_WORK: Final[dict[str, tuple[int, ...]]] = {
+    "RF_TXCTRL": (0x001E3FE3,),  # UM 2.16
+    "TC_PGDELAY": (0xB5,),  # UM 2.18
+    "FS_PLLTUNE": (0xA6,),  # before UM 2.12
+}
+"""Values of other editions of the manual, with which drivers run on real boards."""
+
 
 def can_receive(memory: Memory) -> bool:
     """Whether the receiver understands the frames on the air."""
@@ -480,4 +499,8 @@ def can_send(memory: Memory) -> bool:
 
 
 def _has(memory: Memory, values: dict[str, int]) -> bool:
-    return all(memory.get(r.ALL_REGISTERS[name]) == value for name, value in values.items())
+    return all(
+        memory.get(r.ALL_REGISTERS[name]) in (value, *_ALSO_WORK.get(name, ()))
+        for name, value in values.items()
+        if name != "AGC_TUNE3"
+    )

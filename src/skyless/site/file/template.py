@@ -185,8 +185,8 @@ _FROM_FLOOR_AND_CEILING_M: Final = 0.5
 _FARTHEST_M: Final = 8388.0  # largest coordinate that an anchor can state
 
 
-def site_template(site: Site) -> str:
-    """Site file with a comment on every key of its mode; of anchors it has only position and slot.
+def site_template(site: Site, schedule_comment: str = "") -> str:
+    """Site file with a comment on every key of its mode, and one above the schedule; of anchors only position and slot.
 
     Walls, floor plan and georeference that the site lacks are commented examples.
     """
@@ -195,7 +195,7 @@ def site_template(site: Site) -> str:
         name=json.dumps(site.name, ensure_ascii=False),
         id=site.id,
         master=_MASTER.format(master=site.master) if schedule.needs_master else "",
-        schedule=_schedule(site),
+        schedule=schedule_comment + _schedule(site),
         outline=[list(corner) for corner in (_EXAMPLE_OUTLINE if site.outline_m is UNSET else site.outline_m)],
         no_outline=_off(site.outline_m is not UNSET),
         tx_ps=noise.tx_stamp_ps,
