@@ -1,4 +1,4 @@
-"""Two boards that run the firmware's C in virtual time, 1.5 m apart, whose faults a test plants; and their self-test."""
+"""Two boards that run the firmware's C in virtual time, 1.5 m apart, with planted faults; and their self-test."""
 
 import math
 import os
@@ -21,7 +21,7 @@ from skyless.sim.dw1000 import registers as r
 from skyless.sim.dw1000.chip import Sensors
 from skyless.sim.lab import paper_lab_site
 
-FEW = Amounts(records=24, readings=40, alone_frames=20, pair_s=2.5, clocks_s=1.0)
+FEW = Amounts(records=24, readings=40, alone_frames=20, alone_s=1.0, pair_s=2.5)
 DISTANCE_M = 1.5
 FACTS = (0x52832, 0x41414530, 0x50, 21, 0xFFFFFF5A, 12_288, 6_100)
 RATES = {getattr(termios, f"B{baud}"): baud for baud in (115_200, 230_400, 460_800, 1_000_000)}
@@ -117,7 +117,8 @@ class Pair(EmulatedSite):
         )  # fmt: skip
         noise = replace(lab.noise, tx_stamp_ps=self.fault.stamp_ps, rx_stamp_ps=self.fault.stamp_ps)
         self.faults = iter((self.fault, Fault()))
-        super().__init__(replace(lab, anchors=anchors, noise=noise), [], self.make, seed=seed, wire=WireSettings(piece_bytes=128))
+        site, wire = replace(lab, anchors=anchors, noise=noise), WireSettings(piece_bytes=128)
+        super().__init__(site, [], self.make, seed=seed, wire=wire)
         self.boards = boards
         if self.fault.crystals_ppm is not None:
             for clock, sign in zip(self.medium.clocks, (1.0, -1.0), strict=True):
@@ -146,7 +147,8 @@ class Pair(EmulatedSite):
         offset_ppm = measured.carrier_offset_ppm + asked.offset_bias_ppm * is_b
         power_dbm = measured.rx_power_dbm - asked.weaker_db * is_b
         if not (is_b and self.random.random() < asked.lost):
-            receive(frame, rx_ticks, replace(measured, rx_power_dbm=power_dbm, carrier_offset_ppm=offset_ppm), fault, **more)
+            found = replace(measured, rx_power_dbm=power_dbm, carrier_offset_ppm=offset_ppm)
+            receive(frame, rx_ticks, found, fault, **more)
         if asked.chip == "slips" and self.random.random() < 0.05:
             self.nodes[0].chip.transceiver.raise_bits(r.CLKPLL_LL)
 

@@ -1,6 +1,7 @@
 """The firmware's loop on the chip's model: what it answers, when it sends, what it does when something fails."""
 
 import ctypes
+import math
 import random
 from collections import Counter
 
@@ -26,7 +27,19 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, ru
 
 from skyless.core.ticks import difference, wrap
 from skyless.radio.dw1000 import radio as dw1000
-from skyless.radio.serial.link import Done, Heard, Hello, NotDone, Status, TooLate
+from skyless.radio.serial import link
+from skyless.radio.serial.link import (
+    BoardSettings,
+    Done,
+    Heard,
+    Hello,
+    NotDone,
+    Status,
+    TagConfig,
+    TooLate,
+    Value,
+    pack,
+)
 
 pytestmark = [pytest.mark.site, needs_compiler]
 
@@ -600,3 +613,84 @@ class Fire(RuleBasedStateMachine):
 
 Fire.TestCase.settings = settings(max_examples=40, stateful_step_count=50, deadline=None)
 TestBoardUnderFire = pytest.mark.statistical(Fire.TestCase)
+
+
+# What a self-test asks
+
+
+def reading(file, sub=0, octets=4, times=1, flags=0, data=b""):
+    body = bytes((file,)) + sub.to_bytes(2, "little") + bytes((octets,)) + times.to_bytes(2, "little")
+    return body + bytes((flags,)) + data
+
+
+def test_registers_of_the_chip_are_read_as_often_as_asked_and_one_is_written(stage):
+    value = Value(0, 0, 0, (0xDECA0130).to_bytes(4, "little"))
+    for flags in (0, link.READ_SLOWLY):
+        assert stage.ask(link.READ, reading(0x00, times=1000, flags=flags)) == [value]
+        pattern = bytes.fromhex("a55a00ff")
+        assert stage.ask(link.READ, reading(0x03, times=7, flags=flags, data=pattern)) == [Value(3, 0, 0, pattern)]
+    part = stage.chip.clocking.sensors.part
+    assert stage.ask(link.READ, reading(link.OTP, 0x06)) == [Value(link.OTP, 6, 0, part.to_bytes(4, "little"))]
+    (clocks,) = stage.ask(link.READ, reading(link.CLOCKS))
+    assert difference(stage.air.now_ticks(), int.from_bytes(clocks.data[8:], "little")) * 1e6 < TICKS_PER_US * 1e9
+    assert stage.chip.misuse == {}
+    stage.arrive(FRAME)
+    stage.turn(2)
+    assert kinds(stage.reports()) == [Heard]
+
+
+@pytest.mark.parametrize(
+    "body",
+    [
+        reading(0x00)[:6], reading(0x00, octets=0), reading(0x00, octets=17), reading(0x00, times=1001),
+        reading(0x04, data=bytes(4)), reading(0x03, sub=1, data=bytes(4)), reading(0x03, data=bytes(3)),
+    ],
+)  # fmt: skip
+def test_what_cannot_be_read_is_refused(stage, body):
+    assert stage.ask(link.READ, body) == [NotDone(link.READ, MALFORMED)]
+    assert stage.chip.misuse == {}
+
+
+def test_records_that_test_the_line_have_their_length_and_keep_to_its_rate(stage):
+    begun_us = stage.bus.now_us()
+    stage.send(link.TEST_LINE, bytes((30, 0, 117)))
+    lines, ended_us = [], begun_us
+    while len(lines) < 30:
+        stage.turn()
+        if stage.bus.from_board:
+            lines.append(len(stage.bus.from_board))
+            ended_us = stage.bus.now_us()
+            assert kinds(stage.reports()) == [link.Test]
+    assert set(lines) == {117}
+    assert ended_us - begun_us == pytest.approx(29 * 117 * 10 / 0.4608, rel=0.03)
+    for length in (5, 251):
+        assert stage.ask(link.TEST_LINE, bytes((1, 0, length))) == [NotDone(link.TEST_LINE, MALFORMED)]
+
+
+def test_a_rate_that_flash_does_not_hold_is_given_up_after_silence_and_flash_holds_for_both_modes(stage):
+    rates = []
+    stage.bus.set_rate = rates.append
+    stage.board = CBoard(stage.bus, can_transmit=True)
+    stage.board.begin()
+    for baud, keep in ((115_200, False), (1_000_000, True)):
+        stage.send(link.SET_TAG_CONFIG, bytes((keep,)) + pack(BoardSettings(baud=baud)))
+        stage.pass_us(2_900_000)
+        stage.send(ASK_STATUS)  # which is understood
+        stage.pass_us(2_900_000)
+        stage.pass_us(200_000)
+    assert rates == [460_800, 115_200, 460_800, 1_000_000]
+    assert kinds(stage.reports()).count(TagConfig) == 2
+    stage.board = CBoard(stage.bus, can_transmit=True)
+    stage.board.begin()
+    assert rates[-1] == 1_000_000
+
+
+def test_a_chip_that_does_not_start_says_where_it_ended():
+    stage = BoardStage()
+    stage.board.begin()
+    stage.chip.clocking.restart = lambda: setattr(stage.chip.clocking, "_lock_s", math.inf)
+    stage.config()
+    stage.turn(4)
+    (refused,) = stage.reports()[1:]
+    assert (refused.reason, refused.start_step, refused.identifier) == (RADIO, 2, 0xDECA0130)
+    assert "does not lock" in link.start_failure(refused.start_step, refused.identifier)

@@ -10,6 +10,7 @@ import contextlib
 import json
 import os
 import random
+import re
 import socket
 import subprocess
 import time
@@ -28,10 +29,12 @@ from msgspec.structs import replace
 
 from skyless.cli.main import main, program
 from skyless.core.earth import geodetic
-from skyless.core.site import AnchorSite, GeoreferenceSite
+from skyless.core.site import AnchorSite, GeoreferenceSite, NoiseSite
 from skyless.core.ticks import from_seconds
 from skyless.radio.serial.link import OUTPUTS, BoardSettings, Writer
+from skyless.radio.serial.serial_radio import SerialRadio
 from skyless.run import process
+from skyless.run.doctor import BoardProbe
 from skyless.run.mqtt.messages import FixMessage
 from skyless.sim.lab import lab_site
 from skyless.sim.trajectory import Static
@@ -150,7 +153,7 @@ def test_a_chip_that_is_absent_is_reported_and_found_when_it_is_there(kind):
     async def script(site):
         anchor = site.anchors[3]
         anchor.chip.absent = True
-        await until(lambda: logged(site, "anchor 4", "refuses its configuration", "radio"))
+        await until(lambda: logged(site, "anchor 4", "refuses its configuration", "no DW1000"))
         anchor.chip.absent = False
         await works(site, anchor)
         anchor.chip.absent = True
@@ -363,3 +366,31 @@ def test_a_host_without_latency_skips_nothing_and_a_run_repeats_itself():
     assert first == second
     assert first.skipped == first.late == first.misused == 0
     assert first.heard == first.relayed == 1.0
+
+
+def test_spoilt_lines_are_named_by_anchors_tag_and_doctor_within_ten_seconds_and_the_site_is_not_blamed():
+    site, generator = site_of("host", 6.0, trajectories=[*PLACES, *PLACES]), random.Random(3)
+    watched, listened = site.tags
+    probe = BoardProbe(SerialRadio(watched.wire.path, (1_000_000,), watched.name), None)
+    shares = dict(zip((*site.anchors[:3], watched, listened), (0.01, 0.1, 0.5, 0.83, 0.83), strict=True))
+    for node, share in shares.items():
+        damage = 1.0 - (1.0 - share) ** (1 / 100)
+        node.wire.noise_to_host = lambda data, damage=damage: bytes(
+            byte ^ 0x10 if generator.random() < damage else byte for byte in data
+        )
+
+    async def script(site):
+        await site.stop_host(watched)
+        listening = asyncio.ensure_future(probe.run())
+        await asyncio.sleep(10.0)
+        listening.cancel()
+
+    play(site, script)
+    named = [line for line in site.log if "spoilt on the line" in line]
+    for node in (*site.anchors[:3], listened):
+        assert sum(node.wire.path + " says" in line for line in named) in (1, 2)
+    assert not any("site file" in line for line in site.log)
+    board, *others = probe.checks(NoiseSite())
+    assert board.result == "failed"
+    assert re.search(r"[6-9]\d % of what the board", board.advice)
+    assert [one.result for one in others] == ["not checked"]

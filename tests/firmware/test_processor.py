@@ -44,6 +44,7 @@ OF_BOARD = [*((FIRMWARE / "source" / name).with_suffix(".c") for name in HARDWAR
 COMMAND = [
     "arm-none-eabi-gcc", "-mcpu=cortex-m4", "-mthumb", "-mfloat-abi=hard", "-mfpu=fpv4-sp-d16", "-O2", "-std=gnu11",
     "-ffreestanding", "-nostdlib", "-w", "-fno-tree-loop-distribute-patterns", "-DSKYLESS_FLOAT",
+    '-DSKYLESS_VERSION="0"',
     "-include", FIRMWARE / "source" / "core_sizes.h", "-T", FIRMWARE / "dwm1001.ld",
     *(f"-I{folder}" for folder in (FIRMWARE / "source", SOURCES, SOURCE.parent)),
 ]  # fmt: skip
@@ -571,17 +572,28 @@ def test_the_lights_say_what_the_page_of_the_firmware_states(start):
     assert "D12" in stage.image.leds
 
 
-def test_a_grounded_pin_makes_a_tag_and_what_the_processors_errata_ask_for_is_done(start):
-    """Anomalies 108 (RAM in sleep) and 136 (causes that are set besides the reset pin's)."""
-    for can_transmit in (True, False):
-        stage = start(can_transmit=can_transmit)
-        assert not stage.image.keeps_ram
-        stage.run(5e-3)
-        assert stage.image.keeps_ram
-        stage.image.pull_reset_pin()
-        stage.run(5e-3)
-        hellos = [decode(record[:-2]) for record in records_of(stage)]
-        assert [(one.can_transmit, one.reset_cause) for one in hellos] == [(can_transmit, 0), (can_transmit, 1)]
+@pytest.mark.parametrize(("revision", "can_transmit"), [(5, True), (5, False), (6, True), (7, True), (8, True)])
+def test_a_grounded_pin_makes_a_tag_and_what_the_processors_errata_ask_for_is_done(start, revision, can_transmit):
+    """Anomalies 108 (RAM in sleep), 136 (causes besides the reset pin's); the debug port's lock from revision 7 on."""
+    stage = start(can_transmit=can_transmit, revision=revision)
+    assert not stage.image.keeps_ram
+    assert stage.image.debug_is_open == (revision < 7)
+    stage.run(5e-3)
+    assert stage.image.keeps_ram
+    assert stage.image.debug_is_open
+    stage.image.pull_reset_pin()
+    stage.run(5e-3)
+    hellos = [decode(record[:-2]) for record in records_of(stage)]
+    assert [(one.can_transmit, one.reset_cause) for one in hellos] == [(can_transmit, 0), (can_transmit, 1)]
+    assert is_sound(stage)
+
+
+def test_a_new_board_has_460_800_baud_and_one_whose_flash_holds_another_rate_has_that(start):
+    for baud, rate in ((None, 457_143), (1_000_000, 1_000_000), (115_200, 115_108)):
+        stage = start(10e-3, baud=baud)
+        (zero_us, _), (hello_us, hello) = stage.lines[0], stage.lines[-1]
+        assert 1e6 * 10 * len(hello) / (hello_us - zero_us) == pytest.approx(rate, rel=0.07)
+        assert is_sound(stage)
 
 
 def test_a_crystal_that_never_starts_is_shown(start, monkeypatch):

@@ -1,5 +1,7 @@
 """A conversation over the serial link with a board that the test plays record by record."""
 
+import random
+import re
 import struct
 from collections import Counter
 
@@ -405,3 +407,21 @@ def test_a_board_that_is_silent_is_given_up(first, said):
     first(talk)
     assert talk.poll(BOARD_SILENCE_S) is None
     assert said in talk.poll(1.0)
+
+
+@pytest.mark.parametrize(("share", "words"), [(0.0, 0), (0.01, 1), (0.1, 10), (0.5, 50), (0.83, 83)])
+def test_a_line_that_spoils_records_is_named_once_within_ten_seconds(share, words):
+    """In a stream of 150 receptions a second; the share that is named is about the true one."""
+    generator, talk = random.Random(7), Talk().ready()
+    for number in range(1500):
+        if number % 75 == 0:
+            talk.poll(STATUS_S)
+            talk.status()
+        line = bytearray(talk.board.rx(number, -8000, -8100, 0, bytes(100)))
+        if generator.random() < share:
+            line[generator.randrange(len(line) - 1)] ^= 0x40
+        talk.hear(bytes(line))
+    hints = " ".join(one.text for one in talk.events if isinstance(one, Hint))
+    named = list(map(int, re.findall(r"(\d+) % of what the board", hints)))
+    assert len(named) == (share > 0) or named[0] < 10 <= named[1]
+    assert not named or abs(named[-1] - words) <= max(5, 0.3 * words)

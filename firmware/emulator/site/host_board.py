@@ -34,7 +34,9 @@ class HostBoard(Processor):
 
     def program(self) -> None:
         """Run the board's loop, as the image's ``main`` does."""
-        board = CBoard(self, can_transmit=self._seat.can_transmit, device_id=self._seat.identity, reset_cause=self.reset_cause)
+        board = CBoard(
+            self, can_transmit=self._seat.can_transmit, device_id=self._seat.identity, reset_cause=self.reset_cause
+        )
         board.begin()
         while True:
             wait_us = board.turn()

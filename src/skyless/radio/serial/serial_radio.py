@@ -68,8 +68,9 @@ and a record of 117, whose transfer the estimate of the board's counter lags: 5 
 half of it would do (``benchmarks/firmware.py site``)."""
 
 _LINE_S: Final = 10.0
-"""The line is judged by the records of this time, and from this number of spoilt ones on."""
+_LINE_POLLS: Final = 6
 _MIN_SPOILT: Final = 3
+"""The line is judged by the records of this time at most; after this number of polls, and spoilt records, at least."""
 SPOILT_SHARE: Final = 0.1
 """From this share of spoilt records on a line is as good as none; from ``NOTABLE_SHARE`` on it is reported."""
 
@@ -115,7 +116,7 @@ class LineQuality:
         self._before.append((self.sound, self.spoilt))
         share = spoilt / max(sound + spoilt, 1)
         level = max((limit for limit in (NOTABLE_SHARE, SPOILT_SHARE) if share >= limit), default=0.0)
-        if spoilt < _MIN_SPOILT or level <= self._reported:
+        if len(self._before) < _LINE_POLLS or spoilt < _MIN_SPOILT or level <= self._reported:
             return None
         self._reported = level
         return share

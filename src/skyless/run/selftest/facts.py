@@ -76,14 +76,14 @@ class BoardFacts(Struct):
     trouble: str = ""
     """Why its test ended early."""
     lines: list[LineTest] = []
-    processor: list[int] = []
+    processor: tuple[int, int, int, int, int, int, int] | None = None
     """In the order of the firmware's ``enum probe``."""
     start_step: int | None = None
     """Where the chip's start ended, if it did not start."""
     readings: list[Reading] = []
     otp: dict[str, int] = {}
     clocks: list[Clocks] = []
-    counts: list[int] = []
+    counts: tuple[int, int, int, int, int] | None = None
     """Time until the chip's PLL locked in µs, slips of its clock and of its carrier, the time of the last reception in
     µs, and records that tested the line."""
     temperature_c: float | None = None
@@ -112,7 +112,8 @@ def judge(report: Report) -> list[Check]:
     """Every check of a report; each that failed has a sentence of its own."""
     checks = [check for board in report.boards for check in _board(board)]
     if len(report.boards) == 2 and all(board.tx_ticks for board in report.boards):
-        checks += _pair(*report.boards, report.distance_m)
+        a, b = report.boards
+        checks += _pair(a, b, report.distance_m)
     return checks
 
 
@@ -142,12 +143,12 @@ def _board(board: BoardFacts) -> Iterator[Check]:
     yield _check(name, fails=bool(board.trouble), sentence=board.trouble, finding=found, advice="")
     if board.lines:
         yield _line(f"{name}, line", board)
-    if board.processor:
-        yield _processor(f"{name}, processor", board)
+    if board.processor is not None:
+        yield _processor(f"{name}, processor", board.processor, board.reset_cause)
     if board.readings:
         yield _chip(f"{name}, DW1000", board)
     if board.otp:
-        part, trim = board.otp["part"], board.otp["crystal_trim"] & 0x1F
+        part, trim = board.otp.get("part", 0), board.otp.get("crystal_trim", 0) & 0x1F
         sentence = "The crystal was never trimmed: offsets up to 20 ppm."
         if not part:
             sentence = "The chip's memory holds no part number: it was never tested."
@@ -155,15 +156,17 @@ def _board(board: BoardFacts) -> Iterator[Check]:
         yield _check(f"{name}, factory data", fails=not (part and trim), sentence=sentence, finding=found)
     if len(board.clocks) > 1:
         yield from _clocks(name, board.clocks[0], board.clocks[-1])
-    if board.counts:
-        yield from _counts(name, board)
+    if board.counts is not None:
+        yield from _counts(name, board, *board.counts[:4])
     if board.asked:
         yield _sending(f"{name}, delayed frames", board)
 
 
 def _line(name: str, board: BoardFacts) -> Check:
     """Whether the board's own rate is clean, and which rates are."""
-    spoilt = {baud: max(1 - one.came / one.sent for one in board.lines if one.baud == baud) for baud in link.BAUDS}
+    spoilt = {one.baud: 0.0 for one in board.lines} | {board.baud: 0.0}
+    for one in board.lines:
+        spoilt[one.baud] = max(spoilt[one.baud], 1.0 - one.came / max(one.sent, 1))
     clean = sorted(baud for baud, share in spoilt.items() if share == 0.0)
     found = f"Clean at {', '.join(f'{baud:,}' for baud in clean)} baud; it works at {board.baud:,}."
     if clean:
@@ -176,8 +179,8 @@ def _line(name: str, board: BoardFacts) -> Check:
     return _check(name, fails=board.baud not in clean, sentence=sentence, finding=found, advice=advice)
 
 
-def _processor(name: str, board: BoardFacts) -> Check:
-    part, _, word, *port, stack, used = board.processor[:7]
+def _processor(name: str, facts: tuple[int, int, int, int, int, int, int], cause: int) -> Check:
+    part, _, word, reset_pin, debug, stack, used = facts
     revision, share = word >> 4 & 0xF, used / max(stack, 1)
     needed = 2 if _REVISIONS.get(revision, 3) >= 3 else 1
     sentence, advice = "", REPORT
@@ -185,11 +188,11 @@ def _processor(name: str, board: BoardFacts) -> Check:
         sentence = f"This processor is a {part:X}, not an nRF52832."
     elif revision not in _REVISIONS:
         sentence = f"Unknown revision {revision}: please report."
-    elif board.reset_cause & _BAD_CAUSES:
-        sentence = f"Its firmware failed, and started again (cause {board.reset_cause:#04x})."
+    elif cause & _BAD_CAUSES:
+        sentence = f"Its firmware failed, and started again (cause {cause:#04x})."
     elif share >= 0.8:
         sentence = f"The stack was used to {100 * share:.0f} %."
-    elif (port[0], port[1] & 0xFF)[:needed] != _OPEN_PORT[:needed]:
+    elif (reset_pin, debug & 0xFF)[:needed] != _OPEN_PORT[:needed]:
         sentence, advice = "UICR was not flashed: reset button or debug port do not work.", "skyless flash"
     found = f"nRF52832, revision {_REVISIONS.get(revision)}, stack used to {100 * share:.0f} %."
     return _check(name, fails=bool(sentence), sentence=sentence, finding=found, advice=advice)
@@ -216,7 +219,7 @@ def _chip(name: str, board: BoardFacts) -> Check:
 
 def _clocks(name: str, first: Clocks, last: Clocks) -> Iterator[Check]:
     """Both crystals of the processor, and the chip's counter, over the time between two readings."""
-    passed_s = 1e-6 * (last.us - first.us & 0xFFFF_FFFF)
+    passed_s = 1e-6 * max(last.us - first.us & 0xFFFF_FFFF, 1)
     slow_ppm = 1e6 * ((last.slow_periods - first.slow_periods & 0xFF_FFFF) / _SLOW_HZ / passed_s - 1.0)
     sentence = "The slow crystal does not run; sleeping tags will be off."
     found = f"Against the fast one {slow_ppm:+.0f} ppm over {passed_s:.0f} s."
@@ -227,8 +230,7 @@ def _clocks(name: str, first: Clocks, last: Clocks) -> Iterator[Check]:
     yield _check(f"{name}, chip's counter", fails=abs(chip_ppm) > 60.0, sentence=sentence, finding=found)
 
 
-def _counts(name: str, board: BoardFacts) -> Iterator[Check]:
-    lock_us, clock, carrier, reception_us = board.counts[:4]
+def _counts(name: str, board: BoardFacts, lock_us: int, clock: int, carrier: int, reception_us: int) -> Iterator[Check]:
     sentence = f"The clock slips ({clock} times, the carrier's {carrier}): supply."
     found = f"It locked within {lock_us / 1000:.1f} ms and did not slip."
     fails = bool(clock or carrier)
@@ -287,7 +289,7 @@ def direction(sender: BoardFacts, receiver: BoardFacts) -> Direction | None:
     if len(rows) < _MIN_FRAMES:
         return None
     sent_s, late_s = _times(sender, rows)
-    left = (sent_s[2:] - sent_s[1:-1]) / (sent_s[2:] - sent_s[:-2])
+    left = (sent_s[2:] - sent_s[1:-1]) / np.maximum(sent_s[2:] - sent_s[:-2], TICK_S)
     beside = late_s[1:-1] - left * late_s[:-2] - (1.0 - left) * late_s[2:]
     rate, begin, end = (
         np.polyfit(sent_s[part], late_s[part], 1)[0]
@@ -359,8 +361,9 @@ def _pair(a: BoardFacts, b: BoardFacts, distance_m: float | None) -> Iterator[Ch
     yield _check("pair, power", fails=abs(less_db) > 4.0, sentence=sentence, finding=found, advice=_PLACE)
     differ, stated = abs(there.counter_ppm), f"{there.carrier_ppm:+.1f} and {back.carrier_ppm:+.1f} ppm"
     is_unequal = abs(there.carrier_ppm + back.carrier_ppm) > 0.5
-    sentence = f"The boards state offsets of {stated}, not opposite ones." if is_unequal else ""
-    sentence, found = sentence or f"The crystals differ by {differ:.0f} ppm.", f"The crystals differ by {differ:.1f} ppm."
+    sentence = f"The boards state offsets of {stated}, not opposite ones."
+    sentence = sentence if is_unequal else f"The crystals differ by {differ:.0f} ppm."
+    found = f"The crystals differ by {differ:.1f} ppm."
     yield _check("pair, crystals", fails=is_unequal or differ > 20.0, sentence=sentence, finding=found)
     jitter_ps, drifted = max(there.jitter_ps, back.jitter_ps), f"{there.drift_ppm:+.2f} ppm in {there.passed_s:.0f} s"
     sentence = f"Stamps jitter by {jitter_ps:.0f} ps: first path not found, metal near?"

@@ -4,32 +4,35 @@ import asyncio
 import contextlib
 import time
 from collections import Counter
-from collections.abc import AsyncIterator, Callable, Sequence
-from contextlib import asynccontextmanager
+from collections.abc import Callable, Sequence
 from typing import Any, Final, TypeVar
 
 from msgspec import Struct
 from msgspec.structs import replace
 
 from skyless.core.air.frame import fcs
-from skyless.core.ticks import DEFAULT_ANTENNA_DELAY_TICKS, DELAYED_TX_GRANULARITY_TICKS, from_seconds, wrap
+from skyless.core.ticks import (
+    DEFAULT_ANTENNA_DELAY_TICKS,
+    DELAYED_TX_GRANULARITY_TICKS,
+    difference,
+    from_seconds,
+    wrap,
+)
 from skyless.core.version import installed_version
 from skyless.radio.serial import link
-from skyless.radio.serial.link import (
-    BAUDS,
-    BoardSettings,
-    Done,
-    Heard,
-    Hello,
-    NotDone,
-    Status,
-    TagConfig,
-    TooLate,
-    Value,
-)
 from skyless.radio.serial.serial_port import BoardClock, SerialPort
-from skyless.run.selftest import facts
-from skyless.run.selftest.facts import BoardFacts, Clocks, LineTest, Reading, Report
+from skyless.run.selftest.facts import (
+    CHIP_HZ,
+    FRAME_BYTES,
+    OTP_WORDS,
+    PATTERN,
+    BoardFacts,
+    Clocks,
+    Heard,
+    LineTest,
+    Reading,
+    Report,
+)
 
 Answer = TypeVar("Answer")
 
@@ -41,13 +44,15 @@ class Amounts(Struct, frozen=True):
     """Of each length, at each rate, each way."""
     readings: int = 1000
     alone_frames: int = 100
+    alone_s: float = 5.0
     pair_s: float = 60.0
     """For which two boards send in turns."""
-    clocks_s: float = 5.0
 
 
 LINE_BYTES: Final = (27, 117)
 """A HELLO, and a reception of a beacon."""
+_BURST: Final = 8
+"""Test records that are sent at once."""
 _ANSWER_S: Final = 0.3
 _TRIES: Final = 10
 _HELLO_TRIES: Final = 4
@@ -55,9 +60,9 @@ _TRIAL_S: Final = 3.5
 """After which a board has given up a rate at which it understood nothing."""
 _LEAD_S: Final = 12e-3
 _FRAME_S: Final = 7.5e-3
-"""Between a frame of one board and the next of the other; a board holds one, so its next must not come before it left."""
-_BURST: Final = 8
-"""Test records that are sent at once."""
+"""Between a frame of one board and the next of the other. A board holds one: its next must not come before it left."""
+_FRAME: Final = b"\x41\x88skyless selftest"
+"""The begin of a test frame: a data frame that no tag takes for a beacon."""
 
 
 class TroubleError(Exception):
@@ -67,41 +72,29 @@ class TroubleError(Exception):
 class Bench:
     """One board and its port (``serial_port.PortUser``)."""
 
-    def __init__(self, name: str, path: str, make_port: Callable[..., SerialPort] = SerialPort) -> None:
+    def __init__(self, name: str, path: str) -> None:
         self.facts = BoardFacts(name, path)
-        self.clock = BoardClock()
-        self.tests: Counter[int] = Counter()
-        """Records that tested the line, by their length."""
-        self.settings = BoardSettings()
-        self._wanted: tuple[type, ...] = ()
-        self._answer: asyncio.Future[Any] | None = None
-        self._reader, self._writer = link.Reader(), link.Writer()
+        self.port = SerialPort(path, link.BAUDS[0], self._note_trouble)
         self._trouble = f"There is no {path}."
-        self._port = make_port(path, BAUDS[0], self._note)
         self._opened = asyncio.Event()
         self._send: Callable[[bytes], None] = lambda data: None  # noqa: ARG005 - nothing is open
+        self._reader, self._writer, self._clock = link.Reader(), link.Writer(), BoardClock()
+        self._wanted: tuple[type, ...] = ()
+        self._answer: asyncio.Future[Any] | None = None
+        self._settings = link.BoardSettings()
+        self._tests: Counter[int] = Counter()
+        """Records that tested the line, by their length."""
         self._pending: dict[int, int] = {}
-        """Frames by their dx."""
-
-    def _note(self, reason: str) -> None:
-        self._trouble = f"{reason[:1].upper()}{reason[1:]}."
-
-    @asynccontextmanager
-    async def running(self) -> AsyncIterator[None]:
-        """Hold the port open."""
-        running = asyncio.ensure_future(self._port.run(self))
-        try:
-            yield
-        finally:
-            running.cancel()
-            await asyncio.gather(running, return_exceptions=True)
+        """Numbers of frames by their dx."""
 
     # What the port calls
 
+    def _note_trouble(self, reason: str) -> None:
+        self._trouble = f"{reason[:1].upper()}{reason[1:]}."
+
     def on_open(self, send: Callable[[bytes], None]) -> None:
         """The port is open."""
-        self._send = send
-        self._reader = link.Reader()
+        self._send, self._reader = send, link.Reader()
         send(b"\0")
         self._opened.set()
 
@@ -111,45 +104,41 @@ class Bench:
 
     def on_data(self, data: bytes) -> None:
         """Take the board's records."""
-        now_s = time.monotonic()
         for raw in self._reader.read(data):
             record = link.decode(raw)
             if isinstance(record, link.Test):
-                self.tests[record.length] += 1
-            elif isinstance(record, Heard):
-                self._hear(record, now_s)
-            elif isinstance(record, Done | TooLate):
+                self._tests[record.length] += 1
+            elif isinstance(record, link.Heard):
+                self._hear(record)
+            elif isinstance(record, link.Done | link.TooLate):
                 self._end_sending(record)
-            elif isinstance(record, Status):
-                self.clock.update(record.ticks, now_s)
+            elif isinstance(record, link.Status):
+                self._clock.update(record.ticks, time.monotonic())
             if self._answer is not None and isinstance(record, self._wanted) and not self._answer.done():
                 self._answer.set_result(record)
 
-    def _hear(self, record: Heard, now_s: float) -> None:
-        self.clock.update(record.rx_ticks, now_s)
-        number = frame_number(record.frame)
-        measured = record.diagnostics
-        if number is not None:
-            self.facts.heard.append(
-                facts.Heard(number, record.rx_ticks, measured.rx_power_dbm, measured.carrier_offset_ppm)
-            )
+    def _hear(self, record: link.Heard) -> None:
+        self._clock.update(record.rx_ticks, time.monotonic())
+        if record.frame.startswith(_FRAME):
+            number, measured = int.from_bytes(record.frame[len(_FRAME) :][:4], "little"), record.diagnostics
+            heard = Heard(number, record.rx_ticks, measured.rx_power_dbm, measured.carrier_offset_ppm)
+            self.facts.heard.append(heard)
 
-    def _end_sending(self, record: Done | TooLate) -> None:
-        number, sending = self._pending.pop(record.dx_ticks, None), self.facts.sending
+    def _end_sending(self, record: link.Done | link.TooLate) -> None:
+        number = self._pending.pop(record.dx_ticks, None)
         if number is None:
             return
-        if isinstance(record, TooLate):
-            sending.late += 1
+        if isinstance(record, link.TooLate):
+            self.facts.late += 1
             return
-        sending.tx_ticks[number] = record.tx_ticks
-        at_ticks = wrap((record.dx_ticks & -DELAYED_TX_GRANULARITY_TICKS) + DEFAULT_ANTENNA_DELAY_TICKS)
-        if record.tx_ticks != at_ticks:
-            off = (record.tx_ticks - at_ticks + (1 << 39)) % (1 << 40) - (1 << 39)
-            sending.wrong.append((number, off))
+        self.facts.tx_ticks[number] = record.tx_ticks
+        due_ticks = wrap((record.dx_ticks & -DELAYED_TX_GRANULARITY_TICKS) + DEFAULT_ANTENNA_DELAY_TICKS)
+        if record.tx_ticks != due_ticks:
+            self.facts.wrong.append((number, difference(record.tx_ticks, due_ticks)))
 
     # To the board
 
-    async def ask(
+    async def _ask(
         self, kind: int, body: bytes, *answers: type[Answer], tries: int = _TRIES, wait_s: float = _ANSWER_S
     ) -> Answer:
         """Ask until one of these answers comes, as lines may spoil some. Raises TroubleError."""
@@ -161,168 +150,157 @@ class Bench:
                 return found
         raise TroubleError(f"The board at {self.facts.path} does not answer.")
 
-    async def at_rate(self, baud: int) -> None:
-        """Open the port at a rate. Raises TroubleError."""
+    async def _hello_at(self, baud: int) -> link.Hello | None:
+        """Open the port at a rate; the board's identity, or None if it does not answer. Raises TroubleError."""
         self._opened.clear()
-        self._port.baud = baud
-        self._port.reopen(None)
-        with contextlib.suppress(TimeoutError):
+        self.port.baud = baud
+        self.port.reopen(None)
+        try:
             await asyncio.wait_for(self._opened.wait(), 2.0)
-            return
-        raise TroubleError(self._trouble)
-
-    async def hello(self) -> Hello | None:
-        """The board's identity; None if it does not answer at this rate."""
+        except TimeoutError:
+            raise TroubleError(self._trouble) from None
         with contextlib.suppress(TroubleError):
-            return await self.ask(link.ASK_HELLO, bytes((link.MAJOR, link.MINOR)), Hello, tries=_HELLO_TRIES)
+            return await self._ask(link.ASK_HELLO, bytes((link.MAJOR, link.MINOR)), link.Hello, tries=_HELLO_TRIES)
         return None
 
     async def connect(self) -> None:
         """Find the board at one of its rates. Raises TroubleError."""
-        for baud in BAUDS:
-            await self.at_rate(baud)
-            hello = await self.hello()
+        for baud in link.BAUDS:
+            hello = await self._hello_at(baud)
             if hello is not None:
                 break
         else:
             raise TroubleError(f"No board of Skyless answers at {self.facts.path}: another port, or no firmware?")
         self.facts.firmware, self.facts.device_id = hello.firmware, hello.device_id.hex()
-        self.facts.reset_cause = hello.reset_cause
+        self.facts.reset_cause = hello.reset_cause or 0
         if (hello.major, hello.minor) < (link.MAJOR, 4):
             raise TroubleError("Its firmware is too old to be tested: skyless flash brings the present one.")
-        self.settings = replace((await self.ask(link.ASK_TAG_CONFIG, b"", TagConfig)).settings, mode=0)
-        self.facts.baud = self.settings.baud
+        self._settings = (await self._ask(link.ASK_TAG_CONFIG, b"", link.TagConfig)).settings
+        self.facts.baud = self._settings.baud
 
-    async def set_rate(self, baud: int) -> bool:
-        """Go to another rate until the next start; False, at the old one, if the board is not understood there."""
-        wanted = replace(self.settings, baud=baud)
-        with contextlib.suppress(TroubleError):  # a line that spoils much may have lost the answer only
-            await self.ask(link.SET_TAG_CONFIG, b"\0" + link.pack(wanted), TagConfig, tries=_HELLO_TRIES)
-        await self.at_rate(baud)
-        if await self.hello() is not None:
+    async def _set(self, settings: link.BoardSettings) -> None:
+        """Use settings until the next start; a line that spoils much may lose the answer only."""
+        with contextlib.suppress(TroubleError):
+            body = b"\0" + link.pack(settings)
+            await self._ask(link.SET_TAG_CONFIG, body, link.TagConfig, tries=_HELLO_TRIES)
+
+    async def _set_rate(self, baud: int) -> bool:
+        """Go to another rate; False, at its own one, if the board is not understood there."""
+        await self._set(replace(self._settings, mode=0, baud=baud))
+        if await self._hello_at(baud) is not None:
             return True
         await asyncio.sleep(_TRIAL_S)
-        await self.at_rate(self.facts.baud)
+        await self._hello_at(self.facts.baud)
         return False
 
-    async def read(
-        self, file: int, sub: int = 0, octets: int = 4, times: int = 1, *, slowly: bool = False, data: bytes = b""
-    ) -> Value:
-        """READ. Raises TroubleError."""
-        body = bytes((file,)) + sub.to_bytes(2, "little") + bytes((octets,)) + times.to_bytes(2, "little")
-        return await self.ask(link.READ, body + bytes((slowly * link.READ_SLOWLY,)) + data, Value, wait_s=1.0)
+    async def _read(self, file: int, sub: int = 0, octets: int = 4, times: int = 1, more: bytes = b"\0") -> link.Value:
+        """READ; ``more`` are its flags, and what is to be written. Raises TroubleError."""
+        numbers = (file, 1), (sub, 2), (octets, 1), (times, 2)
+        body = b"".join(number.to_bytes(size, "little") for number, size in numbers)
+        return await self._ask(link.READ, body + more, link.Value, wait_s=1.0)
 
-    async def words(self, file: int, sub: int = 0) -> list[int]:
+    async def _words(self, file: int, sub: int = 0) -> list[int]:
         """A reading of words of four bytes."""
-        data = (await self.read(file, sub)).data
+        data = (await self._read(file, sub)).data
         return [int.from_bytes(data[at : at + 4], "little") for at in range(0, len(data) - 3, 4)]
 
     # Steps
 
     async def test_line(self, baud: int, records: int) -> None:
-        """Both ways at one rate, to which the port is set; rates that say nothing count as spoilt."""
-        is_there = baud == self._port.baud or await self.set_rate(baud)
+        """Both ways at one rate; where the board is not understood all is spoilt."""
+        is_there = baud == self.port.baud or await self._set_rate(baud)
         for size in LINE_BYTES:
             came = [0, 0]
             with contextlib.suppress(TroubleError):
                 if is_there:
                     came[0] = await self._test_from_board(baud, records, size)
                     came[1] = await self._test_to_board(baud, records, size)
-            for from_board, number in ((True, came[0]), (False, came[1])):
-                self.facts.lines.append(LineTest(baud, from_board, size, records, min(number, records)))
+            ways = zip((True, False), came, strict=True)
+            self.facts.lines += [LineTest(baud, way, size, records, min(number, records)) for way, number in ways]
 
     async def _test_from_board(self, baud: int, records: int, size: int) -> int:
         """How many of the board's records come."""
-        self.tests.clear()
+        self._tests.clear()
         self._send(self._writer.record(link.TEST_LINE, records.to_bytes(2, "little") + bytes((size,))))
         ends_s = time.monotonic() + records * size * 10.5 / baud + 4 * _ANSWER_S
-        while self.tests[size] < records and time.monotonic() < ends_s:
+        while self._tests[size] < records and time.monotonic() < ends_s:
             await asyncio.sleep(0.02)
-        return self.tests[size]
+        return self._tests[size]
 
     async def _test_to_board(self, baud: int, records: int, size: int) -> int:
         """How many records the board gets."""
-        test = bytes((0, 0, size)) + bytes(range(256 - size + link.TEST_OVERHEAD + 3, 256))
-        before = (await self.words(link.COUNTS))[4]
+        body = bytes((0, 0, size)) + bytes(range(256 - size + link.TEST_OVERHEAD + 3, 256))
+        before = (await self._words(link.COUNTS))[4]
         for at in range(0, records, _BURST):
             number = min(_BURST, records - at)
-            self._send(b"".join(self._writer.record(link.TEST_LINE, test) for _ in range(number)))
+            self._send(b"".join(self._writer.record(link.TEST_LINE, body) for _ in range(number)))
             await asyncio.sleep(number * size * 10.5 / baud)
         await asyncio.sleep(_ANSWER_S)
-        return (await self.words(link.COUNTS))[4] - before
+        return (await self._words(link.COUNTS))[4] - before
 
     async def use_cleanest_rate(self) -> None:
         """Stay at the board's own rate if it is clean, or go to the one that spoils least."""
-        least = {baud: min(one.came for one in self.facts.lines if one.baud == baud) for baud in BAUDS}
-        best = max(BAUDS, key=lambda baud: (least[baud], baud == self.facts.baud, baud))
-        if best != self._port.baud:
-            await self.set_rate(best)
+        least = {baud: min(one.came for one in self.facts.lines if one.baud == baud) for baud in link.BAUDS}
+        best = max(link.BAUDS, key=lambda baud: (least[baud], baud == self.facts.baud, baud))
+        if best != self.port.baud:
+            await self._set_rate(best)
 
-    async def test_chip(self, amounts: Amounts) -> bool:
+    async def test_chip(self, times: int) -> bool:
         """Processor, identifier, a pattern and the factory's data; whether the chip has started."""
-        found, times = self.facts, amounts.readings
-        found.processor = await self.words(link.FACTS)
-        delays = DEFAULT_ANTENNA_DELAY_TICKS, DEFAULT_ANTENNA_DELAY_TICKS
-        answer = await self.ask(link.CONFIG, _body(self._writer.config(*delays)), Status, NotDone, wait_s=1.0)
-        found.start_step = answer.start_step if isinstance(answer, NotDone) else None
-        for hz in facts.CHIP_HZ[: 1 if found.start_step else 2]:
-            slowly = hz == facts.CHIP_HZ[0]
-            one = await self.read(0x00, times=times, slowly=slowly)
-            expected, shown = f"{link.DEVICE_ID:08X}", one.data[::-1].hex().upper()
-            found.identifiers.append(Reading(hz, expected, shown, times, one.differing))
-            if found.start_step is None:
-                one = await self.read(0x03, 0, len(facts.PATTERN), times, slowly=slowly, data=facts.PATTERN)
-                shown = one.data.hex().upper()
-                found.patterns.append(Reading(hz, facts.PATTERN.hex().upper(), shown, times, one.differing))
-        if found.start_step is None:
-            for name, address in facts.OTP_WORDS.items():
-                found.otp[name] = (await self.words(link.OTP, address))[0]
-        return found.start_step is None
+        found = self.facts
+        part, variant, revision, pin, lock, stack, used = (await self._words(link.FACTS))[:7]
+        found.processor = part, variant, revision, pin, lock, stack, used
+        config = link.unstuff(self._writer.config(DEFAULT_ANTENNA_DELAY_TICKS, DEFAULT_ANTENNA_DELAY_TICKS)[:-1])
+        assert config is not None
+        answer = await self._ask(link.CONFIG, config[2:-2], link.Status, link.NotDone, wait_s=1.0)
+        found.start_step = answer.start_step if isinstance(answer, link.NotDone) else None
+        has_started = found.start_step is None
+        for hz in CHIP_HZ if has_started else CHIP_HZ[:1]:
+            flags = bytes((link.READ_SLOWLY if hz == CHIP_HZ[0] else 0,))
+            one = await self._read(0x00, times=times, more=flags)
+            found.readings.append(_reading(hz, link.DEVICE_ID.to_bytes(4, "little"), one, times))
+            if has_started:
+                one = await self._read(0x03, 0, len(PATTERN), times, flags + PATTERN)
+                found.readings.append(_reading(hz, PATTERN, one, times))
+        if has_started:
+            found.otp = {name: (await self._words(link.OTP, address))[0] for name, address in OTP_WORDS.items()}
+        return has_started
 
-    async def note_clocks(self) -> None:
-        """Read all clocks at once."""
-        data = (await self.read(link.CLOCKS)).data
+    async def begin_frames(self) -> None:
+        """Read all clocks at once, and turn the receiver on."""
+        await self._read_clocks()
+        self._clock.reset()
+        await self._ask(link.RX_ON, b"", link.Status)
+
+    async def _read_clocks(self) -> None:
+        data = (await self._read(link.CLOCKS)).data
         us, slow, ticks = (int.from_bytes(data[at:end], "little") for at, end in ((0, 4), (4, 8), (8, 13)))
         self.facts.clocks.append(Clocks(us, slow, ticks))
 
-    async def receive(self) -> None:
-        """Turn the receiver on."""
-        self.clock.reset()
-        await self.ask(link.RX_ON, b"", Status)
-
     def send_frame(self, number: int) -> None:
         """Send a numbered frame some milliseconds from now."""
-        now_ticks = self.clock.read(time.monotonic())
+        now_ticks = self._clock.read(time.monotonic())
         if now_ticks is None:
             return
-        body = _FRAME + number.to_bytes(4, "little") + bytes(range(facts.FRAME_BYTES - len(_FRAME) - 6))
+        body = _FRAME + number.to_bytes(4, "little") + bytes(range(FRAME_BYTES - len(_FRAME) - 6))
         dx_ticks = wrap(now_ticks + from_seconds(_LEAD_S))
         self._pending[dx_ticks] = number
-        self.facts.sending.asked += 1
+        self.facts.asked += 1
         self._send(self._writer.tx_at(dx_ticks, body + fcs(body)))
 
     async def finish(self) -> None:
-        """What has been counted and measured meanwhile; then the board is as it was."""
-        await self.note_clocks()
-        self.facts.counts = await self.words(link.COUNTS)
-        status = await self.ask(link.ASK_STATUS, b"", Status)
+        """What was counted and measured meanwhile; then the board has its own settings again."""
+        await self._read_clocks()
+        lock_us, clock, carrier, reception_us, tested = (await self._words(link.COUNTS))[:5]
+        self.facts.counts = lock_us, clock, carrier, reception_us, tested
+        status = await self._ask(link.ASK_STATUS, b"", link.Status)
         self.facts.temperature_c, self.facts.supply_v = status.temperature_c, status.supply_v
+        await self._set(self._settings)
 
 
-_FRAME: Final = b"\x41\x88skyless selftest"
-"""The begin of a test frame: a data frame that no tag takes for a beacon."""
-
-
-def frame_number(frame: bytes) -> int | None:
-    """The number of a test frame; None for others."""
-    at = len(_FRAME)
-    return int.from_bytes(frame[at : at + 4], "little") if frame.startswith(_FRAME) else None
-
-
-def _body(line: bytes) -> bytes:
-    record = link.unstuff(line[:-1])
-    assert record is not None
-    return record[2:-2]
+def _reading(hz: int, expected: bytes, value: link.Value, times: int) -> Reading:
+    """With the digits of a number, highest first."""
+    return Reading(hz, expected[::-1].hex().upper(), value.data[::-1].hex().upper(), times, value.differing)
 
 
 async def measure(
@@ -331,50 +309,52 @@ async def measure(
     amounts: Amounts | None = None,
     reach: Callable[[str], None] = lambda step: None,  # noqa: ARG005
 ) -> Report:
-    """Test boards one after the other, then two of them together. ``reach`` is called at the begin of each step."""
+    """Test each board alone, then two of them together. ``reach`` is called at the begin of each step."""
     amounts = amounts or Amounts()
-    report = Report(installed_version(), time.strftime("%Y-%m-%d %H:%M"), distance_m, [one.facts for one in benches])
-    async with contextlib.AsyncExitStack() as stack:
-        for bench in benches:
-            await stack.enter_async_context(bench.running())
-        ready = [bench for bench in benches if await _alone(bench, amounts, reach)]
-        try:
-            await _together(ready, amounts, reach)
-        except TroubleError as error:
-            for bench in ready:
-                bench.facts.trouble = str(error)
-    return report
-
-
-async def _alone(bench: Bench, amounts: Amounts, reach: Callable[[str], None]) -> bool:
-    """Line, processor and chip; whether the chip can be used."""
+    made = time.strftime("%Y-%m-%d %H:%M")
+    running = [asyncio.ensure_future(bench.port.run(bench)) for bench in benches]
     try:
-        reach(f"{bench.facts.name}: connecting")
+        work = [_test_alone(bench, amounts, reach) for bench in benches]
+        ready = [bench for bench, can_send in zip(benches, await asyncio.gather(*work), strict=True) if can_send]
+        try:
+            await _send_frames(ready, amounts, reach)
+        except TroubleError as error:
+            ready[0].facts.trouble = str(error)
+    finally:
+        for task in running:
+            task.cancel()
+        await asyncio.gather(*running, return_exceptions=True)
+    return Report(installed_version(), made, distance_m, [bench.facts for bench in benches])
+
+
+async def _test_alone(bench: Bench, amounts: Amounts, reach: Callable[[str], None]) -> bool:
+    """Line, processor and chip; whether the chip can be used."""
+    name = bench.facts.name
+    try:
+        reach(f"{name}: connecting")
         await bench.connect()
-        for baud in sorted(BAUDS):
-            reach(f"{bench.facts.name}: line at {baud:,} baud")
+        for baud in sorted(link.BAUDS):
+            reach(f"{name}: line at {baud:,} baud")
             await bench.test_line(baud, amounts.records)
         await bench.use_cleanest_rate()
-        reach(f"{bench.facts.name}: processor and chip")
-        return await bench.test_chip(amounts)
+        reach(f"{name}: processor and chip")
+        return await bench.test_chip(amounts.readings)
     except TroubleError as error:
         bench.facts.trouble = str(error)
         return False
 
 
-async def _together(benches: Sequence[Bench], amounts: Amounts, reach: Callable[[str], None]) -> None:
-    """Send in turns; the receivers' first minute is part of it. A board alone sends only some frames."""
+async def _send_frames(benches: Sequence[Bench], amounts: Amounts, reach: Callable[[str], None]) -> None:
+    """Let two boards send in turns from the moment that they receive, or one alone. Raises TroubleError."""
     if not benches:
         return
-    is_pair = len(benches) > 1
-    seconds = amounts.pair_s if is_pair else max(amounts.clocks_s, 4 * _FRAME_S * amounts.alone_frames)
+    seconds = amounts.pair_s if len(benches) > 1 else amounts.alone_s
+    period_s = _FRAME_S if len(benches) > 1 else seconds / amounts.alone_frames
     reach(f"{' and '.join(one.facts.name for one in benches)}: frames for {seconds:.0f} s")
     for bench in benches:
-        await bench.note_clocks()
-        await bench.receive()
-    period_s = _FRAME_S if is_pair else seconds / amounts.alone_frames
-    frames, began_s = round(seconds / period_s), time.monotonic()
-    for number in range(frames):
+        await bench.begin_frames()
+    began_s = time.monotonic()
+    for number in range(round(seconds / period_s)):
         await asyncio.sleep(max(began_s + number * period_s - time.monotonic(), 0.0))
         benches[number % len(benches)].send_frame(number)
     await asyncio.sleep(_ANSWER_S)
