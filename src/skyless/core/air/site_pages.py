@@ -7,6 +7,7 @@ from typing import Annotated, Any, Final, Literal
 from zlib import crc32
 
 from msgspec import Struct
+from msgspec.structs import asdict
 
 from skyless.core.air.almanac import (
     AccuracyPage,
@@ -402,11 +403,7 @@ def _encode_schedule(page: SchedulePage) -> bytes:
 
 def _encode_noise(page: NoisePage) -> bytes:
     return _NOISE.pack(
-        NOISE_PAGE,
-        _real("NoisePage.tx_stamp_s", page.tx_stamp_s, 0.0, MAX_NOISE),
-        _real("NoisePage.rx_stamp_s", page.rx_stamp_s, 0.0, MAX_NOISE),
-        _real("NoisePage.white_fm", page.white_fm, 0.0, MAX_NOISE),
-        _real("NoisePage.random_walk_fm", page.random_walk_fm, 0.0, MAX_NOISE),
+        NOISE_PAGE, *(_real(f"NoisePage.{name}", value, 0.0, MAX_NOISE) for name, value in asdict(page).items())
     )
 
 
