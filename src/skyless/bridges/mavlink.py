@@ -290,11 +290,7 @@ CRC_EXTRAS: Final = {_LAYOUTS[kind].number: _LAYOUTS[kind].crc_extra for kind in
 
 
 def encoded(message: Message, *, sequence: int, system: int, component: int) -> bytes:
-    """Encode a message as a frame of MAVLink 2.
-
-    Raises:
-        struct.error, OverflowError: a value does not fit its field.
-    """
+    """Encode a message as a frame of MAVLink 2. Raises struct.error, OverflowError: a value does not fit its field."""
     layout = _LAYOUTS[type(message)]
     values: list[float] = []
     for value in msgspec.structs.astuple(message):

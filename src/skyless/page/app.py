@@ -349,11 +349,7 @@ _SEND_BUFFER_BYTES: Final = 262_144  # data for a slow page that waits in the ke
 
 
 def bind(host: str, port: int | None) -> socket.socket:
-    """Open a socket at the address; without a port at 8080, or the next free one.
-
-    Raises:
-        SkylessError: the socket cannot listen there.
-    """
+    """Open a socket at the address; without a port at 8080, or the next free one. Raises SkylessError if it cannot."""
     if port is not None:
         return _bind(host, port)
     for number in range(PORT, PORT + 50):

@@ -64,11 +64,7 @@ class MqttAddress(Struct, frozen=True):
         return ((self.host, self.port), *self.others)
 
     def tls_context(self) -> ssl.SSLContext | None:
-        """TLS settings for the broker; None without TLS.
-
-        Raises:
-            SkylessError: the file of certificates cannot be used.
-        """
+        """TLS settings for the broker; None without TLS. Raises SkylessError if the certificates cannot be used."""
         return tls_context(self.ca) if self.tls else None
 
 

@@ -250,11 +250,7 @@ class Saved(Struct, frozen=True):
 
 
 def saved_without_file(site: Site, survey: Survey, ranges: PairRanges, unix_s: float) -> Saved:
-    """Return the site after a survey where there is no file to write.
-
-    Raises:
-        SkylessError: the result is not a valid site.
-    """
+    """Return the site after a survey where there is no file to write. Raises SkylessError if it is not valid."""
     placed = surveyed_site(site, survey)
     check_site(placed, Path("the survey's result"))
     return Saved(placed, _record(site, survey, ranges, unix_s))
