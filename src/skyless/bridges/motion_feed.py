@@ -162,5 +162,4 @@ class _Datagrams(asyncio.DatagramProtocol):
         self._on_data = on_data
 
     def datagram_received(self, data: bytes, _address: object) -> None:
-        """Pass on a datagram."""
         self._on_data(data)

@@ -450,7 +450,6 @@ class _Server(uvicorn.Server):
         yield
 
     def drop_connections(self) -> None:
-        """Close the remaining connections."""
         self.force_exit = True
         for connection in list(self.server_state.connections):
             transport = getattr(connection, "transport", None)

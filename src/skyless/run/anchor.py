@@ -345,7 +345,6 @@ class Anchors:
         self._links = tuple(self._link(node, address) for node in self.nodes)
 
     def _link(self, node: AnchorNode, address: MqttAddress | None) -> Link | None:
-        """Return an anchor's connection to the broker."""
         link = link_of(address, node.id, site=self._site.id, kind="anchor")
         if link is not None:
             asked = reader(RequestMessage, node.on_request, partial(node.refuse, "bad-request"))

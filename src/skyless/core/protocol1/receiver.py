@@ -113,7 +113,6 @@ class Receiver(BeaconReceiver):
         return False
 
     def _process(self, beacon: Beacon) -> Fix | NoFixReason:
-        """Process an admitted beacon."""
         neighbours, rx_ticks = self._admission.neighbours, self._admission.rx_ticks
         tx_ticks = neighbours.rows[neighbours.row].tx_ticks
         self._read_almanac(beacon)

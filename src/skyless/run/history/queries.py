@@ -512,7 +512,6 @@ class _Way:
         self._before_ms, self._x, self._y = -math.inf, 0.0, 0.0
 
     def add(self, now_ms: int, x: float, y: float, std_m: float) -> None:
-        """Add the next fix."""
         moved_m = math.hypot(x - self._x, y - self._y)
         is_new = now_ms - self._before_ms > self._gap_ms
         if is_new or moved_m >= max(_MOVE_M, _MOVE_SIGMAS * std_m):
