@@ -707,8 +707,7 @@ def _words(origin: GpsGlobalOrigin | SetGpsGlobalOrigin) -> str:
 def make_encoder(url: TargetUrl, context: BridgeContext) -> MavlinkEncoder:
     """Keys: ``profile``, which has no default; ``system`` and ``component``; ``satellites``; ``heading``.
 
-    Raises:
-        SkylessError: one of them is not right.
+    Raises SkylessError: one of them is not right.
     """
     return MavlinkEncoder(
         cast(Profile, url.choice("profile", MAVLINK_PROFILES, "")),

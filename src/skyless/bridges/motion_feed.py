@@ -56,8 +56,7 @@ class MotionFeed:
 
         ``clock``: the host's monotonic clock, as in ``host_s`` of receptions.
 
-        Raises:
-            SkylessError: the address is none of these.
+        Raises SkylessError: the address is none of these.
         """
         url = TargetUrl(address)
         if url.scheme not in {"jsonl+tcp", "mavlink+udp"}:

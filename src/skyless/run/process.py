@@ -294,8 +294,7 @@ def locked(file: Path) -> IO[str]:
 def is_free(host: str, port: int) -> bool:
     """Whether a program could listen on the port.
 
-    Raises:
-        OSError: no program could: not an address of this machine, or a privileged port.
+    Raises OSError: no program could: not an address of this machine, or a privileged port.
     """
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     with socket.socket(family, socket.SOCK_STREAM) as probe:

@@ -332,8 +332,7 @@ def encode_page(page: Page) -> bytes:
     An accuracy page rounds standard deviations to 0.1 mm, the distance to 1 cm and the time to 0.1 s, the latter two
     never to 0.
 
-    Raises:
-        ValueError: a field is out of its range; the message names it.
+    Raises ValueError: a field is out of its range; the message names it.
     """
     return _ENCODERS[type(page)](page)
 

@@ -29,8 +29,7 @@ class Receiver(BeaconReceiver):
     def __init__(self, method: str, *, site: int | None = None, z_bounds_m: tuple[float, float] | None = None) -> None:
         """Create a tag that has heard nothing. ``method``: one of ``SNAPSHOTS``; the rest as for ``skyless.Receiver``.
 
-        Raises:
-            ValueError: there is no such method.
+        Raises ValueError: there is no such method.
         """
         super().__init__()
         self._method_name, self._z_bounds_m = SnapshotMethod(method), z_bounds_m

@@ -83,8 +83,7 @@ class Link:
         Two persistent links with one client identifier would end each other's connection, and a stranger who knows the
         identifier could do so. Therefore the secret ``client_key`` becomes part of it.
 
-        Raises:
-            SkylessError: the address names a file of certificates that cannot be used.
+        Raises SkylessError: the address names a file of certificates that cannot be used.
         """
         self.address = address
         self.connected = False

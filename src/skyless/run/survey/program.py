@@ -612,8 +612,7 @@ class SurveyNode:
     def save(self, serial: int | None = None) -> Saved:
         """Use a result, by default the newest: write the site file, and let the anchors adopt it.
 
-        Raises:
-            SkylessError: there is no such result, or it cannot be used.
+        Raises SkylessError: there is no such result, or it cannot be used.
         """
         live = self.live
         if live is None:
