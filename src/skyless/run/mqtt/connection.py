@@ -36,8 +36,7 @@ _MAX_PACKETS: Final = 100
 
 _QUICK_ACK: Final = getattr(socket, "TCP_QUICKACK", None)
 """Without this option TCP delays acknowledgements by 40 ms, and mosquitto holds messages back until the one before is
-acknowledged. Linux resets it after each use.
-"""
+acknowledged. Linux resets it after each use."""
 
 _REFUSALS: Final = {
     "Bad user name or password": "wrong user name or password",

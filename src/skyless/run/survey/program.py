@@ -344,8 +344,7 @@ class SurveySettings(Struct, frozen=True):
     """The site's file, which is written on request."""
     serves: bool = True
     """Whether it serves the site. Otherwise it only collects, beside a program that serves: it computes, publishes and
-    saves nothing.
-    """
+    saves nothing."""
 
 
 class SurveyNode:
