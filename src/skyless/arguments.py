@@ -76,8 +76,7 @@ IN_PYTHON_ONLY: Final = Option("")
 class Options(Struct, frozen=True, kw_only=True):
     """Options of a command; checked when made.
 
-    Raises:
-        OptionError: naming the option, its value and what would be right.
+    Raises OptionError: naming the option, its value and what would be right.
     """
 
     def __post_init__(self) -> None:

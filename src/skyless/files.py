@@ -32,8 +32,7 @@ Drops = Counter[str]
 def open_source(path: str | PathLike[str]) -> BufferedIOBase:
     """Open a file for reading, through gzip if its first bytes are gzip's.
 
-    Raises:
-        ConfigurationError: the file cannot be opened, or not read a second time, as a pipe.
+    Raises ConfigurationError: the file cannot be opened, or not read a second time, as a pipe.
     """
     try:
         if Path(path).is_fifo():
@@ -49,8 +48,7 @@ def open_source(path: str | PathLike[str]) -> BufferedIOBase:
 def read_lines(path: str | PathLike[str]) -> list[str]:
     """All lines of a text file that is small, or needed whole.
 
-    Raises:
-        ConfigurationError: the file cannot be opened or read to its end.
+    Raises ConfigurationError: the file cannot be opened or read to its end.
     """
     faults: Drops = Counter()
     text = bytearray()

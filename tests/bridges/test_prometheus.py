@@ -44,7 +44,7 @@ def read(metrics, now_s=100.0):
     """All samples: by name and labels, as Prometheus's own client reads them."""
     return {
         (sample.name, *sorted(sample.labels.items())): sample.value
-        for one in text_string_to_metric_families(metrics.text(now_s))
+        for one in text_string_to_metric_families(metrics.figures(now_s))
         for sample in one.samples
     }
 
@@ -129,13 +129,13 @@ def test_nothing_is_said_of_keys_where_there_are_none_nor_of_positions_unasked_a
     metrics.take_fix(a_fix(), 100.0)
     metrics.take_health(tag_health(), 100.0)
     metrics.take_health(anchor_health(), 100.0)
-    assert not any(name in metrics.text(100.0) for name in NOT_HERE)
+    assert not any(name in metrics.figures(100.0) for name in NOT_HERE)
     metrics.take_health(tag_health(trust="open"), 100.0)
     metrics.take_health(anchor_health(chain_ends_unix_s=1.0, code_fault="no-chain"), 100.0)
     samples = read(metrics)
     assert (samples[of_tag("tag_verified")], samples[of_tag("tag_verified_ratio")]) == (0.0, 0.0)
     assert samples["skyless_anchor_codes", ("anchor", "2")] == 0.0
-    assert not any(name in metrics.text(100.0 + 2 * THRESHOLDS.report_s) for name in NOT_HERE)
+    assert not any(name in metrics.figures(100.0 + 2 * THRESHOLDS.report_s) for name in NOT_HERE)
 
 
 def test_the_age_of_a_killed_tag_grows_from_scrape_to_scrape_and_its_gauges_end(metrics):
@@ -179,7 +179,7 @@ def test_nobody_can_fill_the_memory_with_names():
         metrics.take_fix(a_fix(tag=name), 0.0)
         metrics.take_status(StatusMessage(online=True, kind="anchor", name=name))
     assert metrics.dropped == {"too-many-names": 1000, "name": 6}
-    text = metrics.text(0.0)
+    text = metrics.figures(0.0)
     assert len(text) < 2_000_000
     assert text.count("skyless_tag_fixes_total{") == 2000
     assert text.count("skyless_tag_dropped_frames_total{") == 50
@@ -207,7 +207,7 @@ def test_promtool_finds_nothing(metrics):
     if shutil.which("promtool") is None:
         pytest.skip("promtool is not installed: apt-get install prometheus")
     done = subprocess.run(
-        ["promtool", "check", "metrics"], input=metrics.text(100.0), capture_output=True, text=True, check=False
+        ["promtool", "check", "metrics"], input=metrics.figures(100.0), capture_output=True, text=True, check=False
     )
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
 

@@ -1,5 +1,6 @@
 """Frames of protocol 2."""
 
+import protocol1_strategies
 import pytest
 from beacon_strategies import FULL, beacons
 from hypothesis import given, settings
@@ -18,22 +19,13 @@ from skyless.core.air.beacon import (
     signed_bytes,
     with_authentication,
 )
-from skyless.core.air.frame import HEARD, Heard, Malformed, PackedHeard, air_time_s, fcs
+from skyless.core.air.frame import HEARD, Heard, Malformed, PackedHeard, air_time_s
 from skyless.core.air.site_pages import encode_page
 from skyless.core.any_receiver import decode_any
 from skyless.core.protocol1 import beacon as protocol1_codec
+from support.frames import changed, with_fcs
 
 FLAGS_AT, PERIOD_AT = 11, 19
-
-
-def with_fcs(body):
-    return bytes(body) + fcs(bytes(body))
-
-
-def changed(frame, at, value):
-    body = bytearray(frame[:-2])
-    body[at] = value
-    return with_fcs(body)
 
 
 @pytest.mark.site
@@ -47,10 +39,15 @@ def test_round_trip_over_all_ranges(beacon):
     assert len(frame) <= 127 - (10 if beacon.authentication is None else 0)
 
 
-@given(beacons())
+@pytest.mark.parametrize(
+    ("beacons", "encode", "decode"),
+    [(beacons, encode, decode), (protocol1_strategies.beacons, protocol1_codec.encode, protocol1_codec.decode)],
+    ids=["protocol 2", "protocol 1"],
+)
+@given(data=st.data())
 @settings(max_examples=25, deadline=None)
-def test_every_single_bit_flip_is_noticed(beacon):
-    frame = encode(beacon)
+def test_every_single_bit_flip_is_noticed(beacons, encode, decode, data):
+    frame = encode(data.draw(beacons()))
     value = int.from_bytes(frame, "little")
     for bit in range(8 * len(frame)):
         assert decode((value ^ 1 << bit).to_bytes(len(frame), "little")) is Malformed.BAD_FCS

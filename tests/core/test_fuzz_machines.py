@@ -13,12 +13,13 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 
 from skyless.core.air.beacon import Beacon, decode
-from skyless.core.air.frame import MAX_FRAME_BYTES, Reception, fcs
+from skyless.core.air.frame import MAX_FRAME_BYTES, Reception
 from skyless.core.any_receiver import AnyReceiver, new_anchor
 from skyless.core.protocol1.anchor import Anchor
 from skyless.core.site import AnchorSite, ScheduleSite, UnplacedAnchor
 from skyless.core.ticks import TICK_RATE_HZ, wrap
 from support.bench import EVERY_METHOD, LAB, ROOM, Stage, assert_honest, tape
+from support.frames import with_fcs
 
 pytestmark = pytest.mark.site
 
@@ -51,7 +52,7 @@ class Noise:
             place = int(self.generator.choice([2, 7, 11, 12, 16, 17, 20, 22, 23, 25, 26, 32, 37]))
             body[place : place + 2] = self.generator.bytes(2)
         frame = bytes(body[: MAX_FRAME_BYTES - 2])
-        return frame + fcs(frame) if self.generator.random() < 0.9 else frame
+        return with_fcs(frame) if self.generator.random() < 0.9 else frame
 
     def a_body(self):
         return self.seeds[self.generator.integers(len(self.seeds))][:-2]
@@ -211,7 +212,7 @@ class Noise2(Noise):
         else:  # a stamp that nearly fits
             tx_ticks = int.from_bytes(body[12:17], "little") + int(draw.integers(-200_000, 200_000))
             body[12:17] = wrap(tx_ticks).to_bytes(5, "little")
-        return bytes(body) + fcs(bytes(body))
+        return with_fcs(body)
 
 
 class Recorder:

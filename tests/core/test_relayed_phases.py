@@ -9,7 +9,7 @@ from msgspec import UNSET
 from msgspec.structs import replace
 
 from skyless.core.air.beacon import decode
-from skyless.core.air.frame import Reception, fcs
+from skyless.core.air.frame import Reception
 from skyless.core.any_receiver import AnyReceiver, new_anchor
 from skyless.core.ticks import wrap
 from skyless.core.trusted_receiver import SiteTrust, Trust
@@ -18,6 +18,7 @@ from skyless.sim.evaluation.scenarios import Request
 from skyless.sim.impairments import CarrierModel
 from skyless.site.survey.legs import RelayedDifferences
 from support.bench import Stage
+from support.frames import with_fcs
 from support.keyed_air import AttackedAir, made_keys, run_tag
 
 pytestmark = pytest.mark.site
@@ -144,7 +145,7 @@ def test_a_hostile_channel():
         if draw.random() < 0.5:
             body[draw.choice([11, *range(34, len(body))])] = draw.integers(256)
         for hearer in (tag, anchor):
-            hearer.hear(replace(one, frame=bytes(body) + fcs(bytes(body))))
+            hearer.hear(replace(one, frame=with_fcs(body)))
         anchor.transmission(anchor.next_transmission_ticks(one.rx_ticks))
     assert tag.counters["bad-flags"] > 0
     assert tag.counters["fixes"] > 0.7 * len(receptions)

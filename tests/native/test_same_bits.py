@@ -33,7 +33,7 @@ import wasm_core
 from make_core import EXPORTS, FILES
 from skyless.core.air.almanac import GeoreferencePage, NoisePage, SitePage
 from skyless.core.air.beacon import Beacon, StatedPosition, decode, encode
-from skyless.core.air.frame import Diagnostics, Heard, PackedHeard, fcs
+from skyless.core.air.frame import Diagnostics, Heard, PackedHeard
 from skyless.core.air.site_pages import site_issue
 from skyless.core.anchor import site_page_for, site_pages_of
 from skyless.core.estimator.process import ACCEPTED, Packet, process_frame
@@ -46,6 +46,7 @@ from skyless.core.native.views import view
 from skyless.core.tag import position, receiver, search
 from skyless.core.tag.hearing import hear_frame
 from support.bench import ROOM, tape
+from support.frames import with_fcs
 from translator.body import Translator
 from translator.files import translate
 from translator.types import INT, REAL, Elements, Number, Results, Struct, parameter_type
@@ -187,7 +188,7 @@ def frame_of(draw):
     body = bytearray(encode(one)[:-2])
     for _ in range(int(draw.integers(3))):
         body[int(draw.integers(11, len(body)))] = int(draw.integers(256))
-    return bytes(body) + fcs(bytes(body))
+    return with_fcs(body)
 
 
 def drawn_record(made, s, draw):

@@ -123,7 +123,7 @@ class Views:
         """Check that all views agree on each tag; the words for what they say."""
         answers = {tag.tag: tag for tag in questions.tags(self.page).tags}
         rows = {row.tag: row for row in self.watch.picture().tags}
-        text = self.both.metrics.text(self.times.now_s)
+        text = self.both.metrics.figures(self.times.now_s)
         shown = {row[0]: row for row in self.page.state.rows_since(0)}
         in_batches = {row[0]: row for row in self.batched.state.rows_since(0)}
         found = {}

@@ -8,7 +8,7 @@ from msgspec.structs import replace
 from serial_stage import PlayedRadio
 
 from skyless.core.air.almanac import GeoreferencePage
-from skyless.core.air.frame import Heard, Reception, Transmission, fcs
+from skyless.core.air.frame import Heard, Reception, Transmission
 from skyless.core.air.masterless_packets import Packet, Relay
 from skyless.core.alert import Alert
 from skyless.core.anchor import Anchor as FreeAnchor
@@ -30,12 +30,9 @@ from skyless.sim.lab import lab_site, paper_lab_site
 from skyless.sim.listening import TagSpec
 from skyless.sim.trajectory import Static
 from skyless.sim.world import World
+from support.frames import with_fcs
 
 DELAY = 16_450
-
-
-def frame_of(body):
-    return body + fcs(body)
 
 
 class Host:
@@ -106,7 +103,7 @@ def test_another_channel_or_preamble_is_refused(at):
 
 def test_a_frame_leaves_at_dx_without_its_low_bits_and_the_antenna_delay_later():
     host = Host().ready()
-    frame = frame_of(b"a frame")
+    frame = with_fcs(b"a frame")
     assert host.say(host.writer.tx_at(2**40 - 1, frame)) == []
     tx_ticks = (2**40 - 512 + DELAY) % 2**40
     assert host.radio.transmissions == [Transmission(frame, tx_ticks)]
@@ -120,7 +117,7 @@ def test_a_frame_leaves_at_dx_without_its_low_bits_and_the_antenna_delay_later()
     host.board.on_radio_event(Sent(5))  # none of its own
     (status,) = host.say(host.writer.record(link.ASK_STATUS))
     assert (status.sent, status.late) == (1, 2)
-    for wrong in (b"", b"\0\0", frame[:-1] + b"\1", frame_of(bytes(126))):
+    for wrong in (b"", b"\0\0", frame[:-1] + b"\1", with_fcs(bytes(126))):
         assert host.say(host.writer.tx_at(512, wrong)) == [NotDone(link.TX_AT, link.REFUSED_MALFORMED)]
     silent = Host(can_transmit=False).ready()
     assert silent.say(silent.writer.tx_at(512, frame)) == [TooLate(512, link.LATE_NOT_READY)]
@@ -143,7 +140,7 @@ def test_a_board_whose_radio_is_dead_logs_nothing_and_one_that_is_not_fetched_co
 def test_garbage_from_the_host_is_counted_and_hurts_nothing():
     host, rng = Host().ready(), random.Random(2)
     for _ in range(500):
-        record = bytearray(host.writer.tx_at(512, frame_of(b"frame")))
+        record = bytearray(host.writer.tx_at(512, with_fcs(b"frame")))
         record[rng.randrange(len(record))] ^= 1 << rng.randrange(8)
         host.board.on_host_data(rng.randbytes(rng.randrange(200)) + b"\0" + bytes(record))
     host.board.on_host_data(b"\0")

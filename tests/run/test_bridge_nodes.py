@@ -21,6 +21,7 @@ from skyless.run.mqtt.messages import SiteMessage, StatusMessage, Zone, ZonesMes
 from skyless.run.mqtt.topics import EVERY_NODE, fix_topic, health_topic, site_topic, status_topic, zones_topic
 from support.bench import LAB, tape
 from support.bridged_values import BERLIN, a_fix
+from support.gpsd import connected
 from support.mqtt_brokers import Embedded
 from support.processes import SKYLESS, free_port, running_program
 from support.site_messages import tag_health
@@ -121,7 +122,7 @@ async def test_the_command_serves_readers_until_ctrl_c_and_then_says_what_it_did
             process = await stack.enter_async_context(running_program(*SKYLESS, *command, **pipes))
             while b"bridging site" not in await asyncio.wait_for(process.stderr.readline(), 60):
                 pass
-            lines, connection = await reader_of(port)
+            lines, connection = await connected(port)
             site = json.loads(await lines.readline())
             assert (site["type"], site["id"], site["name"]) == ("site", LAB.id, LAB.name)
             programs.publish(fix_topic(LAB.id, "tag2"), a_fix(tag="tag2"))
@@ -137,15 +138,6 @@ async def test_the_command_serves_readers_until_ctrl_c_and_then_says_what_it_did
             out, _ = await asyncio.wait_for(process.communicate(), 30)
             assert process.returncode == 0
             assert json.loads(out)["fixes"] == 2
-
-
-async def reader_of(port):
-    """A reader of a server that may still be starting."""
-    while True:
-        try:
-            return await asyncio.open_connection("127.0.0.1", port)
-        except ConnectionRefusedError:
-            await asyncio.sleep(0.01)
 
 
 @pytest.mark.parametrize("georeference", [None, BERLIN])

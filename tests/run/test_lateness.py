@@ -75,14 +75,20 @@ MILLISECONDS = st.one_of(st.integers(0, 2), st.integers(0, REST_MS), st.integers
 PAUSES = st.dictionaries(st.integers(0, len(HEARD) - 1), st.tuples(MILLISECONDS, MILLISECONDS), max_size=30)
 
 
-@settings(max_examples=20)
-@given(PAUSES, st.integers(0, 8000))
-@pytest.mark.statistical
-def test_no_fix_that_is_given_is_too_old_and_the_counts_add_up(pauses, each_us):
+def slowed(pauses, each_us):
+    """A host that has received all, with these pauses before and at the work for some."""
     host = SlowHost()
     for number, reception in enumerate(HEARD):
         delay_ms, work_ms = pauses.get(number, (0, 0))
         host.receive(reception, 1e-3 * delay_ms, 1e-6 * each_us + 1e-3 * work_ms)
+    return host
+
+
+@settings(max_examples=20)
+@given(PAUSES, st.integers(0, 8000))
+@pytest.mark.statistical
+def test_no_fix_that_is_given_is_too_old_and_the_counts_add_up(pauses, each_us):
+    host = slowed(pauses, each_us)
     assert all(age_s <= FIX_LEAVES_S + 1e-6 for age_s in host.ages_s)
     health = msgspec.json.decode(msgspec.json.encode(host.health()))
     late = {name: health["counters"].get(name, 0) for name in ("late-reception", "late-fix")}
@@ -97,10 +103,7 @@ def test_no_fix_that_is_given_is_too_old_and_the_counts_add_up(pauses, each_us):
 @given(PAUSES, st.integers(0, 8000))
 def test_a_recording_of_a_slow_tag_gives_its_fixes_again_bit_for_bit(pauses, each_us):
     """What was dropped is not in the recording, as the receiver never had it."""
-    host = SlowHost()
-    for number, reception in enumerate(HEARD):
-        delay_ms, work_ms = pauses.get(number, (0, 0))
-        host.receive(reception, 1e-3 * delay_ms, 1e-6 * each_us + 1e-3 * work_ms)
+    host = slowed(pauses, each_us)
     recorded = []
     while (message := host.log.collect(1e3 + len(recorded), UNIX_S)) is not None:
         recorded += message.receptions

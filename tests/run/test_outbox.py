@@ -45,6 +45,12 @@ class Broker:
         self.box.restart()
         self.flying = []
 
+    def take_all(self):
+        """The rest, in a connection that lasts."""
+        self.restart()
+        while self.take() is not None or self.flying:
+            self.acknowledge()
+
 
 def waiting_bytes(box):
     """Payload of all messages that wait or are kept."""
@@ -68,9 +74,7 @@ def test_its_bounds_hold_and_all_losses_are_counted(steps):
         assert len(box._flying) <= LIMITS.window
         assert len(box._queue) <= LIMITS.messages
         assert waiting_bytes(box) <= 2 * LIMITS.topic_bytes + LIMITS.bytes + LIMITS.window * LIMITS.payload
-    broker.restart()
-    while broker.take() is not None or broker.flying:
-        broker.acknowledge()
+    broker.take_all()
     assert waiting_bytes(box) == sum(len(message.payload) for message in box._retained.values())
     assert box.unacknowledged == 0
     unretained = {message for message in broker.got if not message[3]}
@@ -91,9 +95,7 @@ def test_qos_1_comes_in_order_and_completely(steps):
             payload = b"%d" % number
             box.add(step[0], payload, 1, retain=False)
             put.append(payload)
-    broker.restart()
-    while broker.take() is not None or broker.flying:
-        broker.acknowledge()
+    broker.take_all()
     assert list(dict.fromkeys(payload for _, payload, _, _ in broker.got)) == put
     assert box.dropped == 0
     assert box.sent == len(put)

@@ -290,11 +290,7 @@ CRC_EXTRAS: Final = {_LAYOUTS[kind].number: _LAYOUTS[kind].crc_extra for kind in
 
 
 def encoded(message: Message, *, sequence: int, system: int, component: int) -> bytes:
-    """Encode a message as a frame of MAVLink 2.
-
-    Raises:
-        struct.error, OverflowError: a value does not fit its field.
-    """
+    """Encode a message as a frame of MAVLink 2. Raises struct.error, OverflowError: a value does not fit its field."""
     layout = _LAYOUTS[type(message)]
     values: list[float] = []
     for value in msgspec.structs.astuple(message):
@@ -711,8 +707,7 @@ def _words(origin: GpsGlobalOrigin | SetGpsGlobalOrigin) -> str:
 def make_encoder(url: TargetUrl, context: BridgeContext) -> MavlinkEncoder:
     """Keys: ``profile``, which has no default; ``system`` and ``component``; ``satellites``; ``heading``.
 
-    Raises:
-        SkylessError: one of them is not right.
+    Raises SkylessError: one of them is not right.
     """
     return MavlinkEncoder(
         cast(Profile, url.choice("profile", MAVLINK_PROFILES, "")),

@@ -56,8 +56,7 @@ class MotionFeed:
 
         ``clock``: the host's monotonic clock, as in ``host_s`` of receptions.
 
-        Raises:
-            SkylessError: the address is none of these.
+        Raises SkylessError: the address is none of these.
         """
         url = TargetUrl(address)
         if url.scheme not in {"jsonl+tcp", "mavlink+udp"}:
@@ -162,5 +161,4 @@ class _Datagrams(asyncio.DatagramProtocol):
         self._on_data = on_data
 
     def datagram_received(self, data: bytes, _address: object) -> None:
-        """Pass on a datagram."""
         self._on_data(data)

@@ -160,8 +160,7 @@ def _name(hub: Hub) -> str:
 async def run_route(route: Route, log: Log) -> None:
     """Run a route's target until cancelled. A fault is logged, and costs neither fixes nor other targets.
 
-    Raises:
-        SkylessError: it cannot start.
+    Raises SkylessError: it cannot start.
     """
     try:
         while True:

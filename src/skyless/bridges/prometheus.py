@@ -136,22 +136,29 @@ class _Node:
 _Nodes = Sequence[tuple[Labels, _Node]]
 
 
-class SiteMetrics:
+class SiteMetrics(Target):
     """Collects the figures of one site. No I/O; the time is passed in."""
 
-    def __init__(self, table: SiteTable, *, positions: bool = False) -> None:
-        """``positions``: whether to expose the tags' positions."""
+    def __init__(self, table: SiteTable, *, text: str = "", positions: bool = False) -> None:
+        """``positions``: whether to expose the tags' positions. Messages of uncounted nodes are ``dropped``."""
+        super().__init__(text)
         self.table = table
-        self.dropped: Counter[str] = Counter()
-        """Messages of uncounted nodes, by reason."""
         self.site: BridgedSite | None = None
         self._positions = positions
-        text = "From the end of a fix's last frame to the fix; of those fixes that came to the bridge."
+        about = "From the end of a fix's last frame to the fix; of those fixes that came to the bridge."
         self._latencies = Histogram(
-            "skyless_tag_latency_seconds", text, ["tag"], buckets=LATENCY_BOUNDS_S, registry=None
+            "skyless_tag_latency_seconds", about, ["tag"], buckets=LATENCY_BOUNDS_S, registry=None
         )
         self._tags: dict[str, _Node] = {}
         self._anchors: dict[str, _Node] = {}
+
+    def use(self, table: SiteTable) -> None:
+        """Show what the hub's table has."""
+        self.table = table
+
+    def on_site(self, site: BridgedSite) -> None:
+        """The site is known, or has changed."""
+        self.site = site
 
     def on_fix(self, fix: FixMessage) -> None:
         """Count a usable fix, which the table has."""
@@ -184,7 +191,7 @@ class SiteMetrics:
                 nodes[name] = _Node(self.table.all(kind)[name])
         return nodes.get(name)
 
-    def text(self, now_s: float) -> str:
+    def figures(self, now_s: float) -> str:
         """Everything in Prometheus's format."""
         return generate_latest(_Scrape(self._families(now_s))).decode()
 
@@ -315,11 +322,10 @@ class _Scrape(Collector):
         self._families = families
 
     def collect(self) -> Iterable[Metric]:
-        """Return them."""
         return self._families
 
 
-class Prometheus(Target):
+class Prometheus(SiteMetrics):
     """An HTTP server with one page; each connection carries one request.
 
     Written by hand, because libraries' servers wait indefinitely for the end of a request: here each connection has a
@@ -328,35 +334,13 @@ class Prometheus(Target):
 
     def __init__(self, text: str, host: str, port: int, names: Collection[str] = (), *, positions: bool) -> None:
         """``names``: further host names by which it is reached, besides the computer's own and its addresses."""
-        super().__init__(text)
+        super().__init__(SiteTable(0.0), text=text, positions=positions)
         self._names = {*own_names(host), *names}
-        self.metrics = SiteMetrics(SiteTable(0.0), positions=positions)
-        self.dropped = self.metrics.dropped
         self.port = port
         """The port in use; with 0 configured, known once the server runs."""
         self._host = host
         self._open: dict[asyncio.StreamWriter, None] = {}
         """Oldest first."""
-
-    def use(self, table: SiteTable) -> None:
-        """Show what the hub's table has."""
-        self.metrics.table = table
-
-    def on_site(self, site: BridgedSite) -> None:
-        """The site is known, or has changed."""
-        self.metrics.site = site
-
-    def on_fix(self, fix: FixMessage) -> None:
-        """Count it."""
-        self.metrics.on_fix(fix)
-
-    def on_health(self, health: TagHealth | AnchorHealth) -> None:
-        """Count what it states."""
-        self.metrics.on_health(health)
-
-    def on_status(self, status: StatusMessage) -> None:
-        """A tag or an anchor has come or gone."""
-        self.metrics.on_status(status)
 
     async def run(self) -> None:
         """Serve until cancelled. Raises SkylessError if it cannot listen there."""
@@ -404,7 +388,7 @@ class Prometheus(Target):
         if method not in (b"GET", b"HEAD"):
             return _response("405 Method Not Allowed", "only GET is answered here\n")
         if path == b"/metrics":
-            whole = _response("200 OK", self.metrics.text(time.monotonic()), CONTENT_TYPE_PLAIN_0_0_4)
+            whole = _response("200 OK", self.figures(time.monotonic()), CONTENT_TYPE_PLAIN_0_0_4)
         else:
             whole = _response("404 Not Found", "the figures are at /metrics\n")
         return whole if method == b"GET" else whole.partition(b"\r\n\r\n")[0] + b"\r\n\r\n"

@@ -413,7 +413,6 @@ class _BagWriter:
             self._writer.abort()
 
     def write(self, message: RosMessage, time_s: float) -> None:
-        """Write one message at a Unix time."""
         topic = self._topics.get(message.topic)
         if topic is None:
             topic = self._topics[message.topic] = self._writer.add_connection(

@@ -358,8 +358,7 @@ class Hub:
     def on_site(self, site: BridgedSite) -> None:
         """The site is known or has changed.
 
-        Raises:
-            SkylessError: it lacks what every target needs; what only some need is logged.
+        Raises SkylessError: it lacks what every target needs; what only some need is logged.
         """
         if site == self.site:
             return

@@ -95,7 +95,6 @@ class _TcpReader(asyncio.Protocol):
             self.send(message)
 
     def connection_lost(self, exc: Exception | None) -> None:  # noqa: ARG002 - the reason makes no difference
-        """Forget the reader."""
         self._readers.discard(self)
 
     def send(self, data: bytes) -> bool:

@@ -159,8 +159,7 @@ def new_table(path: Path) -> Iterator[TextIO]:
 
     After Ctrl-C, the rows written so far are kept.
 
-    Raises:
-        SkylessError: the file cannot be written.
+    Raises SkylessError: the file cannot be written.
     """
     with writing(path), whole_file(path) as scratch, scratch.open("w", newline="", encoding="utf-8") as file:
         try:
@@ -280,8 +279,7 @@ def _made(struct: type[Options], values: dict[str, Any]) -> Options:
 def check_output(option: str, output: Path | None, *inputs: Path | None) -> None:
     """Check that an output is not another file of the command, which would be destroyed.
 
-    Raises:
-        SkylessError: it is one of them, even by another name.
+    Raises SkylessError: it is one of them, even by another name.
     """
     if output is None:
         return

@@ -83,8 +83,7 @@ def new_anchor(
 
     ``authentication``: the anchor's keys; protocol 1 has none.
 
-    Raises:
-        KeyError: the site has no such anchor.
+    Raises KeyError: the site has no such anchor.
     """
     if site.schedule.needs_master:
         return protocol1_anchor.Anchor(site, anchor_id, lead_s)
@@ -124,8 +123,7 @@ class AnyReceiver:
 
         ``method`` is one of ``METHODS``; all but ``joint`` are methods of protocol 1.
 
-        Raises:
-            ValueError: there is no such method.
+        Raises ValueError: there is no such method.
         """
         if method not in METHODS:
             raise ValueError(f"method {method!r} is not one of {', '.join(METHODS)}")

@@ -71,8 +71,7 @@ def integrity_of(levels: Sequence[float], risk: float, height_known: bool, alert
 def limits_of(risk: float = RISK) -> tuple[float, float]:
     """Multiples of the standard deviation, horizontal and vertical, that errors of a fix exceed with this risk.
 
-    Raises:
-        ValueError: the probability is not between 0 and 0.1.
+    Raises ValueError: the probability is not between 0 and 0.1.
     """
     if not 0.0 < risk <= 0.1:
         raise ValueError(f"risk is {risk!r}; it should be above 0 and at most 0.1")

@@ -49,9 +49,9 @@ from skyless.page.connections import (
 from skyless.page.live import LiveSite, TooManyPagesError
 from skyless.page.playback import Playback, RecordingFile
 from skyless.page.sites import Sites
-from skyless.page.state import PageRequest, read_request
+from skyless.page.state import PageRequest, SiteSurvey, read_request
 from skyless.page.tasks import KINDS, MovedAnchors, OverlayTask, TaskProcess, WhatIfTask
-from skyless.run.mqtt.messages import WrongMessageError
+from skyless.run.mqtt.messages import SurveyFactsMessage, SurveySaveMessage, WrongMessageError
 from skyless.run.process import ending_signals, reserve
 from skyless.run.survey.checked_facts import BadFactsError
 from skyless.run.web import PAGE as LIMITS
@@ -118,8 +118,8 @@ def make_app(services: Services, rules: AccessRules, page: Path = _PAGE) -> Star
         Route("/api/overlay", _overlay, methods=["GET", "POST"]),
         Route("/api/sheet", _sheet, methods=["POST"]),
         Route("/api/zones", _put_zones, methods=["PUT"]),
-        Route("/api/survey/facts", _put_facts, methods=["PUT"]),
-        Route("/api/survey/save", _save_survey, methods=["POST"]),
+        Route("/api/survey/facts", _surveying(SiteSurvey.facts_message, "too many facts"), methods=["PUT"]),
+        Route("/api/survey/save", _surveying(SiteSurvey.save_message, "the request is too long"), methods=["POST"]),
         Route("/api/recordings", _recordings),
         Route("/api/recordings/{name}", _recorded(Playback.summary, json_answer)),
         Route("/api/recordings/{name}/events", _recorded(Playback.events, json_answer)),
@@ -234,18 +234,16 @@ async def _put_floor_plan(request: Request) -> Response:
     return json_answer({"bytes": len(image)})
 
 
-async def _put_facts(request: Request) -> Response:
-    live = _live_of(request)
-    message = live.survey.facts_message(await read_bytes(request, LIMITS.body_bytes, "too many facts"))
-    live.publish_survey(message)
-    return json_answer(message)
+def _surveying(read: Callable[[SiteSurvey, bytes], SurveyFactsMessage | SurveySaveMessage], fault: str) -> _Endpoint:
+    """Create an endpoint that publishes its body to the survey program; ``fault``: why one is too long."""
 
+    async def respond(request: Request) -> Response:
+        live = _live_of(request)
+        message = read(live.survey, await read_bytes(request, LIMITS.body_bytes, fault))
+        live.publish_survey(message)
+        return json_answer(message)
 
-async def _save_survey(request: Request) -> Response:
-    live = _live_of(request)
-    message = live.survey.save_message(await read_bytes(request, LIMITS.body_bytes, "the request is too long"))
-    live.publish_survey(message)
-    return json_answer(message)
+    return respond
 
 
 async def _put_zones(request: Request) -> Response:
@@ -351,11 +349,7 @@ _SEND_BUFFER_BYTES: Final = 262_144  # data for a slow page that waits in the ke
 
 
 def bind(host: str, port: int | None) -> socket.socket:
-    """Open a socket at the address; without a port at 8080, or the next free one.
-
-    Raises:
-        SkylessError: the socket cannot listen there.
-    """
+    """Open a socket at the address; without a port at 8080, or the next free one. Raises SkylessError if it cannot."""
     if port is not None:
         return _bind(host, port)
     for number in range(PORT, PORT + 50):
@@ -456,7 +450,6 @@ class _Server(uvicorn.Server):
         yield
 
     def drop_connections(self) -> None:
-        """Close the remaining connections."""
         self.force_exit = True
         for connection in list(self.server_state.connections):
             transport = getattr(connection, "transport", None)

@@ -119,8 +119,7 @@ class Unpacker:
     def feed(self, data: bytes) -> Iterator[bytes]:
         """Bodies completed by this piece of the stream.
 
-        Raises:
-            WireError: a message is longer than any of this protocol.
+        Raises WireError: a message is longer than any of this protocol.
         """
         buffer = self._buffer
         buffer += data

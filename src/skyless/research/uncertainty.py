@@ -311,8 +311,7 @@ def tracking_bound(
     ``anchors_m``: true positions, shape (n, 3), in the order of their slots, the reference first. ``path_m``: where the
     tag is at each frame, shape (superframes·n, 3).
 
-    Raises:
-        ValueError: the path has no whole number of superframes.
+    Raises ValueError: the path has no whole number of superframes.
     """
     anchors, path = np.asarray(anchors_m, np.float64), np.asarray(path_m, np.float64)
     n, frames = len(anchors), len(path)
@@ -349,8 +348,7 @@ def received_bound(
     frame, shape (frames, 3). ``known``: as of ``relayed_receptions``, shape (frames, n + 1); it, not the settings,
     states what of the mesh is known. ``sendings``: who sends when, if not one anchor after the other in equal slots.
 
-    Raises:
-        ValueError: there is not one row of ``known`` and one sending for each position.
+    Raises ValueError: there is not one row of ``known`` and one sending for each position.
     """
     anchors, path = np.asarray(anchors_m, np.float64), np.asarray(path_m, np.float64)
     n, frames = len(anchors), len(path)

@@ -33,8 +33,7 @@ from skyless.site.alarm_rules import GROUP, read_hours
 
 STOREY_M: Final = 2.5
 """Tags whose heights differ by more than this are on different storeys. Only the horizontal distance counts otherwise:
-heights are less accurate, and one tag may be on a helmet and the other on a fork.
-"""
+heights are less accurate, and one tag may be on a helmet and the other on a fork."""
 
 _FARTHEST_M: Final = 1e6
 _AROUND: Final = tuple(product((-1, 0, 1), repeat=2))

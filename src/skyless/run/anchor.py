@@ -46,8 +46,7 @@ LEAD_GAIN: Final = 1.25
 LEAD_LOSS: Final = 0.998
 """The lead is the time between handing over a frame and its RMARKER. It begins with the radio's ``lead_s``, grows by
 the gain with each late frame, up to the maximum, and shrinks by the loss with each frame sent. A longer lead makes
-relayed stamps older.
-"""
+relayed stamps older."""
 
 ASK_AGAIN_S: Final = 5e-3
 LOST_ANSWER_S: Final = 0.25
@@ -345,7 +344,6 @@ class Anchors:
         self._links = tuple(self._link(node, address) for node in self.nodes)
 
     def _link(self, node: AnchorNode, address: MqttAddress | None) -> Link | None:
-        """Return an anchor's connection to the broker."""
         link = link_of(address, node.id, site=self._site.id, kind="anchor")
         if link is not None:
             asked = reader(RequestMessage, node.on_request, partial(node.refuse, "bad-request"))

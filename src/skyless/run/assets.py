@@ -76,8 +76,7 @@ def read_csv(data: bytes) -> tuple[Asset, ...]:
 
     The header names the columns: ``tag``, and any of the others in any order.
 
-    Raises:
-        WrongMessageError: naming the line.
+    Raises WrongMessageError: naming the line.
     """
     if len(data) > MAX_BYTES:
         raise WrongMessageError(f"the table has {len(data)} bytes; it should have {MAX_BYTES} at most")

@@ -226,8 +226,7 @@ def _lock(folder: Path) -> IO[str]:
 def _reserved(host: str, port: int) -> socket.socket | None:
     """Reserve a port against brokers starting at the same moment; None if another program has it.
 
-    Raises:
-        SkylessError: the host is not an address of this machine, or the port needs privileges.
+    Raises SkylessError: the host is not an address of this machine, or the port needs privileges.
     """
     held = reserve(host, port)
     if held is None:
@@ -311,8 +310,7 @@ class Broker:
 async def start_broker(settings: BrokerSettings | None = None) -> Broker:
     """Start a broker, and return once it accepts MQTT. It ends with this process, however that ends.
 
-    Raises:
-        SkylessError: the port is taken, the folder cannot be used, or nats-server is missing or does not start.
+    Raises SkylessError: the port is taken, the folder cannot be used, or nats-server is missing or does not start.
     """
     settings = settings or BrokerSettings()
     settings.check()
@@ -457,8 +455,7 @@ class StatedAddress:
 def _locked(file: Path) -> IO[str]:
     """Lock the file. A program looking for a broker may hold it briefly, and the previous broker may remove it.
 
-    Raises:
-        OSError: it cannot be written, or another broker states its address there.
+    Raises OSError: it cannot be written, or another broker states its address there.
     """
     for attempt in range(20):
         time.sleep(0.01 if attempt else 0.0)
@@ -509,8 +506,7 @@ def _addresses_in(file: Path) -> tuple[MqttAddress, str] | None:
 def _session_folder() -> Path:
     """Return the user's folder for files that last no longer than a session, created if missing.
 
-    Raises:
-        OSError: there is none private to the user.
+    Raises OSError: there is none private to the user.
     """
     shared = os.environ.get("XDG_RUNTIME_DIR")
     folder = Path(shared) / "skyless" if shared and Path(shared).is_absolute() else None

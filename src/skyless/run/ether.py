@@ -139,8 +139,7 @@ class Ether:
     async def serve(self, host: str, port: int, log: Log = ignore) -> asyncio.Server:
         """Listen; port 0 takes any free one. ``log`` gets a line when no more connections are accepted.
 
-        Raises:
-            OSError: the address cannot be listened on.
+        Raises OSError: the address cannot be listened on.
         """
         loop = asyncio.get_running_loop()
         self._origin_s = self._clock()
@@ -244,8 +243,7 @@ class Ether:
     def transmit(self, client: Client, message: wire.Send) -> None:
         """Plan a transmission, unless it is too late or the node's radio already has one waiting.
 
-        Raises:
-            WireError: the frame is not one that an anchor's radio sends.
+        Raises WireError: the frame is not one that an anchor's radio sends.
         """
         node = client.nodes[message.node]
         if node >= len(self.site.anchors) or len(message.frame) > MAX_FRAME_BYTES:

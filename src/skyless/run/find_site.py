@@ -89,11 +89,7 @@ class _SiteMessage(Struct):
 
 
 async def find_site(address: MqttAddress) -> int:
-    """Wait for a site that is alive, and return its number.
-
-    Raises:
-        SkylessError: there are several; the message names them.
-    """
+    """Wait for a site that is alive, and return its number. Raises SkylessError if there are several, naming them."""
     found: asyncio.Future[list[SiteOnBroker]] = asyncio.get_running_loop().create_future()
     logged = ""
 

@@ -35,8 +35,7 @@ RECORD: Final = np.dtype(
     ]
 )
 """One fix: the tag's number, flags, anchors used, method (0: not stated), time, position, covariance xx, xy, yy,
-standard deviation of z, protection level and velocity.
-"""
+standard deviation of z, protection level and velocity."""
 
 FIELDS: Final = struct.Struct("<IHBBQiiifffHHhh")
 """The same record, for ``struct``."""

@@ -52,8 +52,7 @@ class FixLog:
         self.last_fix_s: float | None = None  # when the last fix was made, by the host's monotonic clock
         self.due_s = 0.0
         """When the last frame needed for the newest fix ended: the fix's own, or for a verified fix the one with the
-        key, which comes later.
-        """
+        key, which comes later."""
         self.latencies = Latencies()
         self.lateness = Lateness()  # which receptions and fixes are too old
         self._reported_serial = 0

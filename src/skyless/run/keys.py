@@ -227,8 +227,7 @@ def read_keys(folder: Path, site: int, seeds: Mapping[int, bytes]) -> SiteKeys:
 
     The first section of each chain is used to verify that seed, signatures and public key belong together.
 
-    Raises:
-        SkylessError: a file is missing, damaged, of another site, or a secret that others can read.
+    Raises SkylessError: a file is missing, damaged, of another site, or a secret that others can read.
     """
     public = read_folder_public(folder, site)
     chains, without = [], []

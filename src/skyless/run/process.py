@@ -41,8 +41,7 @@ _PR_SET_PDEATHSIG: Final = 1
 
 _RESERVED: Final = "\0skyless-{}:{}"
 """Name of an abstract socket of Linux, which has one owner in the same namespace as its ports and ends with its
-process.
-"""
+process."""
 
 _MAX_FILES: Final = 65_536
 """Upper limit of open files: some systems allow billions, and some libraries iterate over all possible ones."""
@@ -294,8 +293,7 @@ def locked(file: Path) -> IO[str]:
 def is_free(host: str, port: int) -> bool:
     """Whether a program could listen on the port.
 
-    Raises:
-        OSError: no program could: not an address of this machine, or a privileged port.
+    Raises OSError: no program could: not an address of this machine, or a privileged port.
     """
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     with socket.socket(family, socket.SOCK_STREAM) as probe:
@@ -421,8 +419,7 @@ class Program(Struct, frozen=True):
     arguments: tuple[str, ...]
     new_file: int | None = None
     """Index of an argument that names a file to create: later starts get another name. The program is not restarted if
-    it ends by itself (a full disk, its limit reached).
-    """
+    it ends by itself (a full disk, its limit reached)."""
     start_after_s: float = 0.0
     """Delay of its first start."""
     logs_lines: bool = False

@@ -156,8 +156,7 @@ def _own_name(site: int) -> tuple[str, IO[str]]:
     A killed recorder leaves a session that the broker fills; the next recorder takes it over and ends it. Another
     user's lock cannot be opened, so its name is skipped.
 
-    Raises:
-        SkylessError: there is no folder for temporary files, or too many recorders run.
+    Raises SkylessError: there is no folder for temporary files, or too many recorders run.
     """
     host = re.sub(r"[^A-Za-z0-9_.-]", "-", socket.gethostname())
     try:

@@ -71,8 +71,7 @@ _MEMORY: Final = 10.0
 """A gap is remembered for this many times its length."""
 _SHARE: Final = 0.15
 """Gaps that fill this share of the remembered time are the tag's rhythm. A single gap of a tag that has been heard for
-long fills 10 %, and is an outage.
-"""
+long fills 10 %, and is an outage."""
 _ALIKE: Final = 0.8
 """A gap counts as being as long as another if it has this share of its length."""
 

@@ -31,8 +31,7 @@ _PURPOSE: Final = 2
 class RangeErrorModel(Struct, frozen=True, forbid_unknown_fields=True):
     """Range errors at tags in metres; positive: the tag receives the anchor late.
 
-    Raises:
-        ValueError: changing errors have no correlation length, or two.
+    Raises ValueError: changing errors have no correlation length, or two.
     """
 
     constant_m: float = 0.0

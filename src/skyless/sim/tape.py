@@ -199,8 +199,7 @@ class Tape:
 
         ``survey_std_m``: standard deviation of the anchors' true positions around the stated ones, per axis.
 
-        Raises:
-            ValueError: an impairment is not modelled; the message names it.
+        Raises ValueError: an impairment is not modelled; the message names it.
         """
         _check(impairments)
         ids = np.array([anchor.id for anchor in site.anchors])
@@ -231,8 +230,7 @@ class Tape:
     def hear(self, tag: int, from_s: float, to_s: float) -> list[Heard]:
         """The beacons emitted in [from_s, to_s) that a tag receives, in order; cheapest in the order of time.
 
-        Raises:
-            ValueError: range errors change, and the span is before one that was asked for.
+        Raises ValueError: range errors change, and the span is before one that was asked for.
         """
         frames = self._cover(from_s, to_s)
         begin, end = np.searchsorted(frames.ticks, (from_s * TICK_RATE_HZ, to_s * TICK_RATE_HZ))

@@ -73,8 +73,7 @@ class Hours(Struct, frozen=True):
 def read_hours(text: str) -> Hours:
     """Parse hours. A range over midnight belongs to the day on which it begins.
 
-    Raises:
-        ValueError: the text is invalid; the message says what would be right.
+    Raises ValueError: the text is invalid; the message says what would be right.
     """
     parts = []
     for piece in text.lower().split(",") if text.strip() else ():

@@ -115,8 +115,7 @@ def draw_floor_plan(axes: Axes, anchors_m: list[tuple[float, float]], *, labels:
 def picture(figure: Figure, kind: str, dpi: float = 130.0) -> bytes:
     """Render a figure to a file of this kind; the same figure always gives the same bytes.
 
-    Raises:
-        ValueError: there is no such kind.
+    Raises ValueError: there is no such kind.
     """
     FigureCanvasAgg(figure)
     file = io.BytesIO()

@@ -6,13 +6,13 @@ from operator import methodcaller
 from typing import TYPE_CHECKING, Any
 
 import msgspec
+from msgspec.structs import asdict
 
 from skyless.arguments import check_choice, python_function
 from skyless.cli.api.fixes import Result, data_frame, figures
 from skyless.cli.api.options import StudyOptions
 from skyless.cli.common import cm
 from skyless.core.arrays import Vector
-from skyless.core.integrity import RISK
 from skyless.research.studies.run import STUDIES, Parts
 from skyless.research.studies.run import run_study as rows_of_study
 from skyless.research.studies.runner import Plan, Row, plan_of
@@ -100,19 +100,8 @@ def run_study(asked: StudyOptions) -> StudyResult:
     Several processes import the calling script, so call this below ``if __name__ == "__main__":``.
     """
     started_s = time.perf_counter()
-    plan = plan_of(
-        asked.method,
-        asked.seed,
-        study=asked.name,
-        quick=asked.quick,
-        conditions=asked.conditions,
-        noise_ps=asked.noise_ps or 100.0,
-        worlds=asked.worlds,
-        seconds=asked.seconds,
-        episodes=asked.episodes,
-        integrity_risk=asked.integrity_risk or RISK,
-        alert_limit_m=asked.alert_limit_m,
-    )
+    amounts = {name: value for name, value in asdict(asked).items() if name in Plan.__struct_fields__}
+    plan = plan_of(study=asked.name, **amounts)
     chosen, resume = STUDIES[asked.name], asked.resume
     rows, parts = rows_of_study(chosen, plan, asked.progress, asked.processes, resume)
     asked.progress(1.0)

@@ -144,8 +144,7 @@ class FixLines:
     async def run(self) -> None:
         """Write until cancelled.
 
-        Raises:
-            OSError: standard output cannot be written; ``BrokenPipeError`` if its reader is gone.
+        Raises OSError: standard output cannot be written; ``BrokenPipeError`` if its reader is gone.
         """
         loop = asyncio.get_running_loop()
         thread = threading.Thread(target=self._write_all, args=(loop,), daemon=True)

@@ -307,8 +307,7 @@ def heard_capacity(*, position: bool = False, page: bool = True, certificate: bo
 def encode(beacon: Beacon) -> bytes:
     """Encode a beacon as a whole frame, FCS included. Standard deviations are rounded up, never too optimistic.
 
-    Raises:
-        ValueError: a field is out of range, or ``heard`` has too many or impossible entries; the message names it.
+    Raises ValueError: a field is out of range, or ``heard`` has too many or impossible entries; the message names it.
     """
     flags = _flags(beacon)
     fault = _fault(beacon, _CAPACITY[flags & ~HAS_PHASES]) or _authentication_fault(beacon, flags)

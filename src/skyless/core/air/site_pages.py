@@ -7,6 +7,7 @@ from typing import Annotated, Any, Final, Literal
 from zlib import crc32
 
 from msgspec import Struct
+from msgspec.structs import asdict
 
 from skyless.core.air.almanac import (
     AccuracyPage,
@@ -331,8 +332,7 @@ def encode_page(page: Page) -> bytes:
     An accuracy page rounds standard deviations to 0.1 mm, the distance to 1 cm and the time to 0.1 s, the latter two
     never to 0.
 
-    Raises:
-        ValueError: a field is out of its range; the message names it.
+    Raises ValueError: a field is out of its range; the message names it.
     """
     return _ENCODERS[type(page)](page)
 
@@ -402,11 +402,7 @@ def _encode_schedule(page: SchedulePage) -> bytes:
 
 def _encode_noise(page: NoisePage) -> bytes:
     return _NOISE.pack(
-        NOISE_PAGE,
-        _real("NoisePage.tx_stamp_s", page.tx_stamp_s, 0.0, MAX_NOISE),
-        _real("NoisePage.rx_stamp_s", page.rx_stamp_s, 0.0, MAX_NOISE),
-        _real("NoisePage.white_fm", page.white_fm, 0.0, MAX_NOISE),
-        _real("NoisePage.random_walk_fm", page.random_walk_fm, 0.0, MAX_NOISE),
+        NOISE_PAGE, *(_real(f"NoisePage.{name}", value, 0.0, MAX_NOISE) for name, value in asdict(page).items())
     )
 
 

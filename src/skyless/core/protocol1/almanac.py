@@ -33,8 +33,7 @@ _ASSUMED_ACCURACY: Final = AccuracyPage(**asdict(AccuracySite()))
 def pages_of(site: Site) -> tuple[Page, ...]:
     """Return all pages of a validated site: schedule, noise, accuracy, anchors in the order of the file, georeference.
 
-    Raises:
-        ValueError: two anchors would share a slot (see ``first_slots``).
+    Raises ValueError: two anchors would share a slot (see ``first_slots``).
     """
     schedule, slots, earth = schedule_of(site), first_slots(site), georeference_page_of(site)
     pages: list[Page] = [

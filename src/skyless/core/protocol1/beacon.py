@@ -131,8 +131,7 @@ def encode(beacon: Beacon) -> bytes:
 
     The standard deviation of the master time is rounded up to 1/64 tick, so that it is never too optimistic.
 
-    Raises:
-        ValueError: a field is out of its range, or there are more ``heard`` than fit; the message names it.
+    Raises ValueError: a field is out of its range, or there are more ``heard`` than fit; the message names it.
     """
     fault = _heard_fault(beacon.anchor, beacon.master, beacon.master_heard, beacon.heard)
     if fault is not None:

@@ -29,8 +29,7 @@ class Receiver(BeaconReceiver):
     def __init__(self, method: str, *, site: int | None = None, z_bounds_m: tuple[float, float] | None = None) -> None:
         """Create a tag that has heard nothing. ``method``: one of ``SNAPSHOTS``; the rest as for ``skyless.Receiver``.
 
-        Raises:
-            ValueError: there is no such method.
+        Raises ValueError: there is no such method.
         """
         super().__init__()
         self._method_name, self._z_bounds_m = SnapshotMethod(method), z_bounds_m
@@ -113,7 +112,6 @@ class Receiver(BeaconReceiver):
         return False
 
     def _process(self, beacon: Beacon) -> Fix | NoFixReason:
-        """Process an admitted beacon."""
         neighbours, rx_ticks = self._admission.neighbours, self._admission.rx_ticks
         tx_ticks = neighbours.rows[neighbours.row].tx_ticks
         self._read_almanac(beacon)

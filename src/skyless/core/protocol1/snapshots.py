@@ -141,9 +141,8 @@ def literal_delayed_covariance(kappa: Vector, tx_var_m2: float, rx_var_m2: float
     return _shared_reference((1.0 - kappa) ** 2 + kappa**2, tx_var_m2, rx_var_m2)
 
 
-def bracketed_covariance(kappa: Vector, tx_var_m2: float, rx_var_m2: float) -> Matrix:
-    """Covariance of the bracketed TDoAs: their stamps and weights are those of the delayed messages."""
-    return literal_delayed_covariance(kappa, tx_var_m2, rx_var_m2)
+bracketed_covariance: Final = literal_delayed_covariance
+"""Covariance of the bracketed TDoAs: their stamps and weights are those of the delayed messages."""
 
 
 def _shared_reference(q: Vector, tx_var_m2: float, rx_var_m2: float) -> Matrix:

@@ -557,8 +557,7 @@ if __name__ == "__main__":
 def collection(live: LiveSite, kind: str) -> Response:
     """Tags with fixes, anchors or zones as GeoJSON: longitude, latitude (WGS 84), height above the ellipsoid.
 
-    Raises:
-        HTTPException: no site is known yet, or it is not georeferenced.
+    Raises HTTPException: no site is known yet, or it is not georeferenced.
     """
     site = live.require_site()
     try:

@@ -56,8 +56,7 @@ def positions_of(
 ) -> PositionAt:
     """Position by time: from stays, of which the first of overlapping ones counts, else from truth that is high enough.
 
-    Raises:
-        SkylessError: a stay has no height, and the site does not state it either.
+    Raises SkylessError: a stay has no height, and the site does not state it either.
     """
     stays_m: list[tuple[Stay, Point]] = []
     for stay in cast("Sequence[Stay]", asked.stays):
@@ -121,8 +120,7 @@ def walk_of(
 
     ``height_m``: of the tag above the floor, if known within some 0.1 m; free otherwise.
 
-    Raises:
-        SkylessError: the recording has no receptions of the tag, or none in the span that give a difference.
+    Raises SkylessError: the recording has no receptions of the tag, or none in the span that give a difference.
     """
     names = recording.summary().raw_tags
     if tag not in names:
@@ -231,8 +229,7 @@ class Biases(Struct, frozen=True):
 def biases_of(asked: CalibrateOptions) -> Biases:
     """Estimate constants of another system's anchors, relative to their mean.
 
-    Raises:
-        SkylessError: the recording cannot be used, or has no differences at a known position.
+    Raises SkylessError: the recording cannot be used, or has no differences at a known position.
     """
     asked.leave_out("tag", "recorded_truth", why="it is for recordings of skyless record")
     path = Path(asked.file)
@@ -352,8 +349,7 @@ def ranges_of(
     ``identifier``: of the site, if it should be checked. ``on_progress`` is called now and then with the share of the
     recording that has been read, ``new_ranger`` with the width of the counters.
 
-    Raises:
-        ConfigurationError: the file cannot be read, or its format has no stamps of anchors.
+    Raises ConfigurationError: the file cannot be read, or its format has no stamps of anchors.
     """
     if format_name == SITE_FORMAT or (format_name is None and is_mcap(path)):
         return _of_site(path, identifier, _Legs(new_ranger(TICK_BITS), on_progress))

@@ -492,8 +492,7 @@ def anchor_distances_m(path: str | PathLike[str], drops: Drops) -> dict[tuple[in
 
     Each is the median of the latest ``_RANGED`` exchanges, so that memory stays flat in the length of the capture.
 
-    Raises:
-        ConfigurationError: the file cannot be opened.
+    Raises ConfigurationError: the file cannot be opened.
     """
     ranging = TwoWayRanging(TICK_BITS, window=_RANGED)
     with open_source(path) as stream:

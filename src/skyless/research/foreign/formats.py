@@ -218,8 +218,7 @@ def open_recording(
     positions that replace those stated by the anchors of a DL-TDoA recording. ``channel``: the only one to read, with
     its carrier phases.
 
-    Raises:
-        ConfigurationError: the file cannot be opened, its format is unknown, or listener or channel are invalid.
+    Raises ConfigurationError: the file cannot be opened, its format is unknown, or listener or channel are invalid.
     """
     chosen = format_of(path, format_name)
     read = _listening(path, chosen, listener)
@@ -245,8 +244,7 @@ _MCAP: Final = b"\x89MCAP0"
 def format_of(path: str | PathLike[str], name: str | None = None) -> Format:
     """The named format, or the one recognised from the file's first bytes.
 
-    Raises:
-        ConfigurationError: the file cannot be opened, or its format is unknown.
+    Raises ConfigurationError: the file cannot be opened, or its format is unknown.
     """
     if name is None:
         return _recognised(path)

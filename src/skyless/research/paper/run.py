@@ -37,8 +37,7 @@ def write_report(plan: Plan, out: Path, reached: Callable[[float], None], proces
 
     The files appear in ``out`` when all are ready; other files there stay.
 
-    Raises:
-        SkylessError: ``out`` cannot be a folder with the report.
+    Raises SkylessError: ``out`` cannot be a folder with the report.
     """
     is_new = not out.exists()
     try:

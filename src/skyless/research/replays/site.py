@@ -257,8 +257,7 @@ class SiteReplay:
         ``method`` and ``integrity`` are used instead of the tags' own, the antenna delays of ``wanted`` instead of the
         anchors' own, and no phases with ``stamps_only``.
 
-        Raises:
-            ConfigurationError: the recording has no raw receptions, none of such a tag, or is of another site.
+        Raises ConfigurationError: the recording has no raw receptions, none of such a tag, or is of another site.
         """
         summary = recording.summary()
         raw_tags = tags_to_replay(summary)
@@ -366,8 +365,7 @@ def summary_of(reports: Sequence[TagReport]) -> dict[str, Any]:
 def recorded_site(recording: McapRecording, identifier: int | None = None) -> Site:
     """The site of a recording.
 
-    Raises:
-        ConfigurationError: the recording lacks its site, or has another one than ``identifier``.
+    Raises ConfigurationError: the recording lacks its site, or has another one than ``identifier``.
     """
     found = recording.site
     if found is None:

@@ -339,7 +339,6 @@ def warming_anchors(plan: Plan, low_ppm: float, high_ppm: float, tau_s: float, n
 
 
 def _turns(plan: Plan) -> list[Case]:
-    """Cases of tags that turn."""
     found = []
     for turn in TURNS_MPS2:
         name = f"turns of {turn:g} m/s² at {_TURNING_MPS:g} m/s"

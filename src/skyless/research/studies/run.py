@@ -37,8 +37,7 @@ def run_study(
 
     Finished cells are kept in the folder ``resume``, and those that are there are not computed.
 
-    Raises:
-        SkylessError: a process died, or the folder cannot be used.
+    Raises SkylessError: a process died, or the folder cannot be used.
     """
     cells = chosen.cells(plan)
     kept = None if resume is None else KeptResults(resume, chosen.name, plan)

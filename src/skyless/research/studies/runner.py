@@ -207,8 +207,7 @@ def run_cells(
 
     An interrupt ends all processes at once.
 
-    Raises:
-        UnfinishedError: a process died.
+    Raises UnfinishedError: a process died.
     """
     with _pool(min(processes or cores(), len(cells))) as pool:
         try:

@@ -46,8 +46,7 @@ _RETRY_S: Final = 1.0
 async def make_streams(stream: "JetStreamContext", site: int, keep_bytes: int) -> None:
     """Make the streams of a site, or update the limits of existing ones. A hub copies from them.
 
-    Raises:
-        SkylessError: the server has no room for these bytes.
+    Raises SkylessError: the server has no room for these bytes.
     """
     all_fixes = {"max_age": KEEP_S, "max_bytes": keep_bytes, "duplicate_window": 120.0}
     for name, taken, limits in (

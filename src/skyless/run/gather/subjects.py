@@ -139,8 +139,7 @@ def nats_address(url: str, option: str = "--nats", ca: Path | None = None) -> Na
 
     Several are separated by commas: ``tls://plant@a,b:4223,c``.
 
-    Raises:
-        SkylessError: with what would be right, never showing the password.
+    Raises SkylessError: with what would be right, never showing the password.
     """
     right = f"nats://[USER@]HOST[:PORT] or tls://[USER@]HOST[:PORT], as nats://127.0.0.1:{FIRST_PORT}"
     fault = SkylessError(f"{option} is {hide_password(url)!r}; it should be {right}")

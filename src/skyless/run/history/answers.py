@@ -97,8 +97,7 @@ def span_of(from_text: str, to_text: str | None, now_unix_s: float) -> Span:
     A time without a date is today's; at the end of the range it is on the day on which the range begins. A day without
     a time means its beginning. Without ``to_text`` the range ends now.
 
-    Raises:
-        SkylessError: a text is not a time, or the range begins in the future or ends before it begins.
+    Raises SkylessError: a text is not a time, or the range begins in the future or ends before it begins.
     """
     now = datetime.fromtimestamp(now_unix_s)
     begin_s = _unix_s("from", from_text, now, now.date())

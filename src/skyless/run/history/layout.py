@@ -27,8 +27,7 @@ FIX_COLUMNS: Final = {
     "flags": "uint16",
 }
 """Sorted by tag and t. ``std_mm`` is the one-sigma radial error; ``hpl_cm`` is 65535 for no level; ``flags`` are those
-of a record of a batch (``run/fix_batch.py``).
-"""
+of a record of a batch (``run/fix_batch.py``)."""
 
 EVENT_COLUMNS: Final = {
     "t": "timestamp[ms, tz=UTC]",
@@ -41,8 +40,7 @@ EVENT_COLUMNS: Final = {
 }
 """``kind`` is an ``EventKind``. ``tag`` is the tag's name and ``zone`` the zone's identifier, null if there is none;
 ``subject`` is ``anchor-<id>`` or what an alarm is about; ``alarm`` is the alarm's id; ``text`` is for people, and names
-the person who acknowledged an alarm.
-"""
+the person who acknowledged an alarm."""
 
 EventKind = Literal["enter", "leave", "alarm-raised", "alarm-ended", "alarm-acknowledged", "offline", "online"]
 

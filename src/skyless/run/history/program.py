@@ -136,8 +136,7 @@ _CHECK_S: Final = 2.0
 _FIRST_FILE_S: Final = 30.0
 FILE_S: Final = 600.0
 """Longest interval between files. The first files come early, so that a new history can be queried; the interval then
-doubles up to this.
-"""
+doubles up to this."""
 _RETRY_S: Final = 5.0  # after a file could not be written
 
 

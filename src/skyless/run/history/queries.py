@@ -49,8 +49,7 @@ from skyless.run.web import HISTORY as LIMITS
 
 _SIDE: Final = 2000
 """Cells along each side of the grid, which is centred on the first fixes. Not a power of two: rows would then share few
-cache lines.
-"""
+cache lines."""
 _OUTSIDE: Final = _SIDE * _SIDE
 _WILD_SHARE: Final = 1e-3
 """Largest share of the time that wild fixes outside the grid may account for."""
@@ -67,8 +66,7 @@ def time_in_cells(files: Sequence[Path], span: Span, cell_mm: int, tags: Collect
     sums_ms = np.zeros(_OUTSIDE + 1, np.int64)
     edges = [np.empty((4, 0), np.int64)]
     """First and last fix of each tag in each batch. Rows: tag, time, longest time that the fix may count (0 for a first
-    one), cell.
-    """
+    one), cell."""
     corner: list[int] = []
     for (tag, t, x, y), gap_ms in read_rows(files, span, tags):
         places = x // cell_mm, y // cell_mm
@@ -205,8 +203,7 @@ _MOVE_SIGMAS: Final = 3.0
 """Shorter moves, in standard deviations of the fix, may be noise and do not lengthen a track."""
 _CONTACT_MS: Final = {False: (1000, 5), True: (10_000, 6)}
 """Length in ms of the intervals in which fixes are compared, and longest interruption of a contact in such intervals,
-by whether days are thinned.
-"""
+by whether days are thinned."""
 _PART_S: Final = 28.0 * 86_400.0
 _NAMED: Final = 5
 """How many known names an error lists."""
@@ -242,8 +239,7 @@ _DWELL: Final = """
 """
 """Stays are the time from each crossing of a zone's border to the tag's next one. Tags in a zone at the beginning enter
 it then. Of two simultaneous crossings the leaving comes first. Sorting by a 64-bit hash costs two thirds of sorting by
-two texts.
-"""
+two texts."""
 
 VIEWS: Final = f"""
     CREATE VIEW fixes AS
@@ -512,7 +508,6 @@ class _Way:
         self._before_ms, self._x, self._y = -math.inf, 0.0, 0.0
 
     def add(self, now_ms: int, x: float, y: float, std_m: float) -> None:
-        """Add the next fix."""
         moved_m = math.hypot(x - self._x, y - self._y)
         is_new = now_ms - self._before_ms > self._gap_ms
         if is_new or moved_m >= max(_MOVE_M, _MOVE_SIGMAS * std_m):

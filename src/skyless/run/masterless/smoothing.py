@@ -99,7 +99,6 @@ class _States:
             self._prior[first : first + number] = variance
 
     def column(self, anchor: int) -> int:
-        """Index of an anchor."""
         return self._column[anchor]
 
     def of_anchor(self, anchor: int) -> list[int]:

@@ -64,11 +64,7 @@ class MqttAddress(Struct, frozen=True):
         return ((self.host, self.port), *self.others)
 
     def tls_context(self) -> ssl.SSLContext | None:
-        """TLS settings for the broker; None without TLS.
-
-        Raises:
-            SkylessError: the file of certificates cannot be used.
-        """
+        """TLS settings for the broker; None without TLS. Raises SkylessError if the certificates cannot be used."""
         return tls_context(self.ca) if self.tls else None
 
 
@@ -86,8 +82,7 @@ def mqtt_address(url: str, ca: Path | None = None) -> MqttAddress:
 
     Several are separated by commas: ``mqtts://ann@a,b:8884,c``.
 
-    Raises:
-        SkylessError: with what would be right, never showing the password.
+    Raises SkylessError: with what would be right, never showing the password.
     """
     several = re.fullmatch(r"([^:/?#]*://(?:[^/?#]*@)?)([^/?#@]*)(.*)", url, re.DOTALL)
     before, hosts, after = several.groups() if several else ("", url, "")
@@ -255,8 +250,7 @@ _OTHERS: Final = 0o077
 def create_access(folder: Path, address: MqttAddress) -> tuple[Path, ...]:
     """Create a folder's missing files with random passwords, keeping existing ones; return their paths.
 
-    Raises:
-        SkylessError: none is missing, the address has a user, or the folder cannot be written.
+    Raises SkylessError: none is missing, the address has a user, or the folder cannot be written.
     """
     if address.user is not None or not _PLAIN_ADDRESS.fullmatch(str(address)):
         raise SkylessError(f"--mqtt is {str(address)!r}; it should be the broker's address without a user")
@@ -281,8 +275,7 @@ def _text(role: Role, address: MqttAddress) -> str:
 def read_access(folder: Path) -> Mapping[Role, str]:
     """Read the password of each role.
 
-    Raises:
-        SkylessError: a file is missing, is accessible to others than its owner, or has no usable password.
+    Raises SkylessError: a file is missing, is accessible to others than its owner, or has no usable password.
     """
     return {role: _password(folder / f"{role}.env") for role in USERS}
 

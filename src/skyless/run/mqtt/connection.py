@@ -36,8 +36,7 @@ _MAX_PACKETS: Final = 100
 
 _QUICK_ACK: Final = getattr(socket, "TCP_QUICKACK", None)
 """Without this option TCP delays acknowledgements by 40 ms, and mosquitto holds messages back until the one before is
-acknowledged. Linux resets it after each use.
-"""
+acknowledged. Linux resets it after each use."""
 
 _REFUSALS: Final = {
     "Bad user name or password": "wrong user name or password",
@@ -329,8 +328,7 @@ async def _open(
 async def check_broker(address: MqttAddress, tls: ssl.SSLContext | None = None) -> None:
     """Check that a broker accepts this client; ``tls`` replaces the address's own TLS settings.
 
-    Raises:
-        SkylessError: it does not; the message says why.
+    Raises SkylessError: it does not; the message says why.
     """
     try:
         connection = await open_connection(address, tls or address.tls_context(), Introduction("", 60))
@@ -401,8 +399,7 @@ def _make_client(address: MqttAddress, tls: ssl.SSLContext | None, who: Introduc
 async def _connect(client: paho.Client, address: MqttAddress, keepalive_s: int) -> None:
     """Let paho connect, which blocks, in a daemon thread: not even the program's end waits for it.
 
-    Raises:
-        OSError: the broker cannot be reached.
+    Raises OSError: the broker cannot be reached.
     """
     loop = asyncio.get_running_loop()
     done: asyncio.Future[None] = loop.create_future()

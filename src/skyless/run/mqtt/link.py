@@ -41,8 +41,7 @@ READER_KEEPALIVE_S: Final = 20
 NODE_KEEPALIVE_S: Final = 10
 """How long a broker may be silent. A link sends a ping after half of this time, and the broker disconnects a client
 that has been silent for three quarters of it; so a busy event loop may delay a ping by a quarter. With 10 s, bridges
-lost their connections.
-"""
+lost their connections."""
 
 _MAX_TOPICS: Final = 10_000
 _FIRST_WAIT_S: Final = 0.1
@@ -83,8 +82,7 @@ class Link:
         Two persistent links with one client identifier would end each other's connection, and a stranger who knows the
         identifier could do so. Therefore the secret ``client_key`` becomes part of it.
 
-        Raises:
-            SkylessError: the address names a file of certificates that cannot be used.
+        Raises SkylessError: the address names a file of certificates that cannot be used.
         """
         self.address = address
         self.connected = False

@@ -681,8 +681,7 @@ def _matrix(values: list[float]) -> Matrix:
 
 REACH_S: Final = 0.25
 """How long before and after its time a message is extrapolated along a straight line; a turning tag leaves the line by
-then.
-"""
+then."""
 
 _MAX_MESSAGES: Final = 64
 

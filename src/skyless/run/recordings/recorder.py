@@ -35,7 +35,6 @@ class _Unwritten(IOBase):
         self._length = 0
 
     def write(self, data: bytes, /) -> int:
-        """Collect a piece."""
         self._parts.append(bytes(data))
         self._length += len(data)
         return len(data)

@@ -344,8 +344,7 @@ class SurveySettings(Struct, frozen=True):
     """The site's file, which is written on request."""
     serves: bool = True
     """Whether it serves the site. Otherwise it only collects, beside a program that serves: it computes, publishes and
-    saves nothing.
-    """
+    saves nothing."""
 
 
 class SurveyNode:
@@ -612,8 +611,7 @@ class SurveyNode:
     def save(self, serial: int | None = None) -> Saved:
         """Use a result, by default the newest: write the site file, and let the anchors adopt it.
 
-        Raises:
-            SkylessError: there is no such result, or it cannot be used.
+        Raises SkylessError: there is no such result, or it cannot be used.
         """
         live = self.live
         if live is None:

@@ -59,8 +59,7 @@ class ProtectionOptions(ComputedOptions, frozen=True, kw_only=True):
     def requirement(self, method: str | None = None, height_std_m: float | None = None) -> "IntegrityRequirement":
         """Them and --tag-height-std as the filter takes them.
 
-        Raises:
-            SkylessError: the method gives no protection levels, so that a limit would have no effect.
+        Raises SkylessError: the method gives no protection levels, so that a limit would have no effect.
         """
         from skyless.core.integrity import RISK, IntegrityRequirement  # noqa: PLC0415 - help needs no NumPy
 

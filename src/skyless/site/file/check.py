@@ -166,11 +166,7 @@ _MAX_FLOORS: Final = 100
 
 
 def check_site(site: Site, file: Path) -> None:
-    """Check the values of a site.
-
-    Raises:
-        ConfigurationError: naming ``file``, the key, its value and what would be right.
-    """
+    """Check the values of a site. Raises ConfigurationError that names ``file``, key, value and what would be right."""
     if not site.name.strip():
         raise ConfigurationError(file, "name", site.name, "a text of at least one character")
     limits = SITE_LIMITS if site.schedule.needs_master else {**SITE_LIMITS, **PROTOCOL_2_LIMITS}

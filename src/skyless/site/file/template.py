@@ -331,8 +331,7 @@ def grid_site(
 
     A side too long for coordinates on the air is centred on the origin.
 
-    Raises:
-        ValueError: there are more anchors than identifiers.
+    Raises ValueError: there are more anchors than identifiers.
     """
     x_m, y_m = _along_side(width_m, spacing_m), _along_side(depth_m, spacing_m)
     count = len(x_m) * len(y_m)

@@ -345,8 +345,7 @@ class MapSummary(Struct, frozen=True):
 def grid_of(floor: Floor, heights_m: tuple[float, ...], step_m: float | None) -> Grid:
     """Grid over the floor's region; by default with some ten thousand points.
 
-    Raises:
-        ValueError: the region has no area or no point inside the outline, or there would be too many points.
+    Raises ValueError: the region has no area or no point inside the outline, or there would be too many points.
     """
     x1, y1, x2, y2 = floor.region_m
     if not (x2 > x1 and y2 > y1):

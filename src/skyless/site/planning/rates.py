@@ -173,8 +173,7 @@ def rate_map(
 ) -> RateMap:
     """Predict tags' reception over the region; by default at some three thousand points.
 
-    Raises:
-        ValueError: the region has no area or no point inside the outline, or there would be too many points.
+    Raises ValueError: the region has no area or no point inside the outline, or there would be too many points.
     """
     x1, y1, x2, y2 = floor.region_m
     grid = grid_of(floor, heights_m, step_m or math.sqrt(max((x2 - x1) * (y2 - y1), 1e-6) * len(heights_m) / _POINTS))

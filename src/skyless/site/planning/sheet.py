@@ -58,8 +58,7 @@ def sheet(
 
     ``file``: the site's file, to which the floor plan's image is relative; without it the image is left out.
 
-    Raises:
-        ConfigurationError: no anchor has a position, or the anchors outline no floor.
+    Raises ConfigurationError: no anchor has a position, or the anchors outline no floor.
     """
     if not site.anchors:
         right = "placed: skyless survey finds positions"

@@ -439,7 +439,6 @@ class _History:
             self._merge(self.leg_variance_m2(site_m2()))
 
     def drop_before(self, t_s: float) -> None:
-        """Drop the blocks from before a time."""
         self.blocks = [block for block in self.blocks if block[0] >= t_s]
         self._early = self._late = 0.0
 

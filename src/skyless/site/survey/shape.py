@@ -73,8 +73,7 @@ class Measured(Struct, frozen=True, eq=False):
 def usable(ranges: PairRanges, facts: Facts) -> Measured:
     """Leave out, with a sentence about each, ranges and facts that are not finite or name anchors without ranges.
 
-    Raises:
-        SkylessError: a standard deviation of the facts is negative, not finite or too large.
+    Raises SkylessError: a standard deviation of the facts is negative, not finite or too large.
     """
     for name in _STDS:
         if not _is_std(getattr(facts, name)):

@@ -44,8 +44,7 @@ def surveyed_site(site: Site, survey: Survey) -> Site:
 
     Anchors that had no position come after those that had one, so the order may differ from that of a file.
 
-    Raises:
-        SkylessError: an anchor would need an antenna delay that no radio has.
+    Raises SkylessError: an anchor would need an antenna delay that no radio has.
     """
     found = survey.determined
     known = [_placed(anchor, found.get(anchor.id), site) for anchor in site.all_anchors]
@@ -91,8 +90,7 @@ def unchanged_anchors(site: Site, survey: Survey) -> tuple[int, ...]:
 def delay_changes_ticks(site: Site, survey: Survey) -> dict[int, int]:
     """Changes of the TX antenna delays of the site's determined anchors.
 
-    Raises:
-        SkylessError: an anchor would need an antenna delay that no radio has.
+    Raises SkylessError: an anchor would need an antenna delay that no radio has.
     """
     found = survey.determined
     return {
@@ -250,11 +248,7 @@ class Saved(Struct, frozen=True):
 
 
 def saved_without_file(site: Site, survey: Survey, ranges: PairRanges, unix_s: float) -> Saved:
-    """Return the site after a survey where there is no file to write.
-
-    Raises:
-        SkylessError: the result is not a valid site.
-    """
+    """Return the site after a survey where there is no file to write. Raises SkylessError if it is not valid."""
     placed = surveyed_site(site, survey)
     check_site(placed, Path("the survey's result"))
     return Saved(placed, _record(site, survey, ranges, unix_s))
@@ -299,8 +293,7 @@ def save_survey(
 ) -> Saved:
     """Write a result into a site's file, or another one, ``out``, and its record next to it.
 
-    Raises:
-        SkylessError: a file cannot be read or written, or the result is not a valid site.
+    Raises SkylessError: a file cannot be read or written, or the result is not a valid site.
     """
     site, out = load_site(file), out or file
     record, image = _record(site, survey, ranges, unix_s), dict[Path, bytes]()
