@@ -5,7 +5,7 @@
 #include "selftest.h"
 
 /* Version of the firmware, in HELLO */
-static const uint8_t VERSION[3] = {0u, 3u, 0u};
+static const uint8_t VERSION[3] = {0u, 4u, 0u};
 
 /* How long before its time a frame is handed to the chip: a reception that is being reported then (0.28 ms), what is
  * written over the SPI until it starts (0.14 ms; docs/hardware.md) and its preamble (0.14 ms). */

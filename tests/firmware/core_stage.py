@@ -8,6 +8,7 @@ from emulator.processor.elf import symbols_of
 
 _SYSTEM_CONTROL = (0xE000E000, 0x1000)
 _FLASH_CONTROL = (0x4001E000, 0x1000)
+_IDENTIFICATION = (0xF0000000, 0x1000)
 _CPACR, _ICACHECNF = 0xE000ED88, 0x4001E540
 _FOREVER = 1 << 62
 
@@ -18,7 +19,7 @@ class BoardCore:
     def __init__(self):
         self.elf = build("core")
         self._at = {name: at for at, _, name in symbols_of(self.elf)}
-        self.processor = Core(self.elf, [_FLASH_CONTROL, _SYSTEM_CONTROL], self._load, self._store)
+        self.processor = Core(self.elf, [_FLASH_CONTROL, _SYSTEM_CONTROL, _IDENTIFICATION], self._load, self._store)
         assert self.processor.run(_FOREVER) == "sleep"
 
     def _load(self, _address, _size):

@@ -63,7 +63,7 @@ class Host:
 def test_it_greets_and_is_configured_step_by_step():
     host = Host(can_transmit=False)
     (hello,) = host.say(host.writer.ask_hello())
-    assert hello == Hello(1, 3, (0, 0, 0), b"a board ", 63_897_600, 40, False, 0, True, True)
+    assert hello == Hello(1, 4, (0, 0, 0), b"a board ", 63_897_600, 40, False, 0, True, True)
     (status,) = host.say(host.writer.record(link.ASK_STATUS))
     assert (status.ticks, status.configured, status.receiving) == (77, False, False)
     assert host.say(host.writer.record(link.RX_ON)) == [NotDone(link.RX_ON, link.REFUSED_MALFORMED)]

@@ -235,7 +235,7 @@ class LinkProtocol(BoardProtocol):
 
     def _hello(self) -> None:
         name = self._radio.name.encode()[:8].ljust(8, b"\0")
-        abilities = link.HAS_PHASES | link.CAN_COMPUTE | (link.CAN_TRANSMIT if self._can_transmit else 0)
+        abilities = link.HAS_PHASES | (link.CAN_TRANSMIT if self._can_transmit else link.CAN_COMPUTE)
         self._write(self._writer.hello(_EMULATED_FIRMWARE, name, abilities))
 
     def _status(self) -> None:

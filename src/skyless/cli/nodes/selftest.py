@@ -26,7 +26,7 @@ from skyless.run.selftest.measure import Bench, measure
 
 app = App(
     name="selftest",
-    help_epilogue="Example: skyless selftest --radio serial:/dev/ttyACM0,/dev/ttyACM1 --apart 1.5 --report board.json",
+    help_epilogue="Example: skyless selftest --radio serial:/dev/ttyACM0,/dev/ttyACM1 --separation 1.5 --report b.json",
 )
 
 
@@ -35,7 +35,7 @@ class SelftestOptions(Options, frozen=True, kw_only=True):
 
     radio: str | None = None
     """Radio of a board that no other program uses: serial:PATH, or two boards that lie 1 to 2 m apart with a comma."""
-    apart: Positive | None = None
+    separation: Positive | None = None
     """Metres between the antennas of two boards, as measured: it shows whether their antenna delays are right."""
     report: Path | None = None
     """File to write the report to, JSON: all that was measured."""
@@ -53,7 +53,7 @@ def selftest(*, asked: SelftestOptions, output: JsonOptions) -> int:
     Each fault has one sentence; the exit code is 1 if there is one. The report file is what to attach to an issue.
     """
     if asked.read is not None:
-        asked.leave_out("radio", "report", "apart", why="--read judges a report again")
+        asked.leave_out("radio", "report", "separation", why="--read judges a report again")
         report = _load(asked.read)
     else:
         report = _test(asked)
@@ -84,7 +84,7 @@ def _test(asked: SelftestOptions) -> Report:
 
     async def work() -> None:
         benches = [Bench(name, path) for name, path in zip("AB", paths, strict=False)]
-        reports.append(await measure(benches, asked.apart, reach=log))
+        reports.append(await measure(benches, asked.separation, reach=log))
 
     run(work(), punctual=True)
     (report,) = reports

@@ -140,9 +140,12 @@ def _check(name: str, *, fails: bool, sentence: str, finding: str, advice: str =
 def _board(board: BoardFacts) -> Iterator[Check]:
     name, version = f"board {board.name}", ".".join(map(str, board.firmware))
     found = f"{board.path}, firmware {version}, device {board.device_id}."
-    yield _check(name, fails=bool(board.trouble), sentence=board.trouble, finding=found, advice="")
-    if board.lines:
-        yield _line(f"{name}, line", board)
+    line = [_line(f"{name}, line", board)] if board.lines else []
+    if board.trouble and line and line[0].result == "failed":  # which explains it
+        yield Check(name, "not checked", board.trouble, "Mend the line first.")
+    else:
+        yield _check(name, fails=bool(board.trouble), sentence=board.trouble, finding=found, advice="")
+    yield from line
     if board.processor is not None:
         yield _processor(f"{name}, processor", board.processor, board.reset_cause)
     if board.readings:
