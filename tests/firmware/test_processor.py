@@ -14,13 +14,15 @@ import pytest
 from cobs import cobs
 from emulator.build import FIRMWARE, build
 from firmware_stage import ASK_STATUS, CONFIG, RX_ON, STACK_BYTES, TX_AT, frame_of, line_of, needs_processor
+from msgspec.structs import replace
 
 from skyless.core.air.frame import Diagnostics, after_rmarker_s
 from skyless.core.native.library import SOURCE
-from skyless.core.ticks import from_seconds, wrap
+from skyless.core.ticks import TICK_S, from_seconds, wrap
 from skyless.radio.dw1000.radio import SOURCES
-from skyless.radio.serial.link import decode
+from skyless.radio.serial.link import BoardSettings, decode, pack
 from skyless.sim.dw1000 import registers as r
+from support.bench import ROOM, tape
 
 pytest.importorskip("unicorn")
 
@@ -594,6 +596,20 @@ def test_a_new_board_has_460_800_baud_and_one_whose_flash_holds_another_rate_has
         (zero_us, _), (hello_us, hello) = stage.lines[0], stage.lines[-1]
         assert 1e6 * 10 * len(hello) / (hello_us - zero_us) == pytest.approx(rate, rel=0.07)
         assert is_sound(stage)
+
+
+def test_a_tag_sleeps_without_flags_of_the_floating_point_unit(start):
+    """Which would end each sleep at once: anomaly 87."""
+    stage = start()
+    stage.image.settings.hold(pack(BoardSettings(mode=1, output=3)))
+    stage.run(30e-3)
+    heard = tape(replace(ROOM, schedule=replace(ROOM.schedule, mode="free", rate_hz=50.0)), 0.8)
+    for one in heard:
+        stage.run(max((one.rx_ticks - heard[0].rx_ticks) * TICK_S + 40e-3 - stage.now_s(), 0.0))
+        stage.chip.receive(one.frame, wrap(stage.timeline.now_ticks), Diagnostics())
+        stage.image.notify()
+    assert "compute_ph" in stage.image.core.cycles_by_function()
+    assert is_sound(stage)
 
 
 def test_a_crystal_that_never_starts_is_shown(start, monkeypatch):

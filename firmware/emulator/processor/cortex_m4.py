@@ -122,6 +122,11 @@ class Core:
         """Whether PRIMASK is set."""
         return bool(self._uc.reg_read(arm.UC_ARM_REG_PRIMASK))
 
+    @property
+    def fpu_flags(self) -> int:
+        """FPSCR's flags of exceptions."""
+        return int(self._uc.reg_read(arm.UC_ARM_REG_FPSCR)) & 0x9F
+
     def register(self, number: int) -> int:
         """R0 to R12, SP (13) and LR (14)."""
         named = {13: arm.UC_ARM_REG_SP, 14: arm.UC_ARM_REG_LR}

@@ -294,6 +294,8 @@ class Image:
                 raise EmulationError(
                     f"WFI at PC 0x{self.core.pc - 2:x} with PRIMASK clear: interrupts are not modelled"
                 )
+            if self.core.fpu_flags:
+                self.misuse["sleep-with-fpu-flags"] += 1  # anomaly 87
             if not self._nvic.wakes:
                 self.paths.end(self.core.cycles)
                 self.is_asleep, self._asleep_since = True, self.core.cycles

@@ -526,16 +526,17 @@ class SerialRadio:
             if self._session is not None:
                 reason = self._session.poll(time.monotonic(), BOARD_SILENCE_S / len(self._bauds))
                 if reason is not None:
-                    self._port.reopen(reason if self._try_next_rate(self._session) else None)
+                    self._port.reopen(reason if self._session.line.sound else self._try_next_rate(reason))
 
-    def _try_next_rate(self, session: LinkSession) -> bool:
-        """Go to the next rate, unless the board was heard at this one. Returns whether all have been tried."""
-        if session.line.sound:
-            return True
+    def _try_next_rate(self, reason: str) -> str | None:
+        """Look for a silent board at the next rate. Returns the reason with the rates when all have been tried."""
         self._bauds.rotate(-1)
         self._port.baud = self._bauds[0]
         self._untried = self._untried - 1 or len(self._bauds)
-        return self._untried == len(self._bauds)
+        if self._untried < len(self._bauds):
+            return None
+        rates = ", ".join(f"{baud}" for baud in self._bauds)
+        return f"{reason} (tried {rates} baud)" if len(self._bauds) > 1 else reason
 
     # What the port calls
 
@@ -581,7 +582,7 @@ async def set_up(path: str, bauds: Sequence[int], computing: Computing) -> TagCo
         running.cancel()
         await asyncio.gather(running, return_exceptions=True)
     if isinstance(event, Gone):
-        raise SkylessError(f"{event.reason} ({', '.join(map(str, bauds))} baud were tried)")
+        raise SkylessError(event.reason)
     if config is None:
         raise SkylessError(f"the board at {path} says no settings")
     return config

@@ -71,6 +71,7 @@ class BoardFacts(Struct):
     firmware: tuple[int, ...] = ()
     device_id: str = ""
     reset_cause: int = 0
+    can_transmit: bool = True
     baud: int = 0
     """Rate of its port, as its flash has it."""
     trouble: str = ""
@@ -161,7 +162,9 @@ def _board(board: BoardFacts) -> Iterator[Check]:
         yield from _clocks(name, board.clocks[0], board.clocks[-1])
     if board.counts is not None:
         yield from _counts(name, board, *board.counts[:4])
-    if board.asked:
+    if not board.can_transmit:
+        yield Check(f"{name}, delayed frames", "not checked", "It only listens: pin 13 is tied to ground.")
+    elif board.asked:
         yield _sending(f"{name}, delayed frames", board)
 
 

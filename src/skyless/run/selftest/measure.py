@@ -172,7 +172,7 @@ class Bench:
         else:
             raise TroubleError(f"No board of Skyless answers at {self.facts.path}: another port, or no firmware?")
         self.facts.firmware, self.facts.device_id = hello.firmware, hello.device_id.hex()
-        self.facts.reset_cause = hello.reset_cause or 0
+        self.facts.reset_cause, self.facts.can_transmit = hello.reset_cause or 0, hello.can_transmit
         if (hello.major, hello.minor) < (link.MAJOR, 4):
             raise TroubleError("Its firmware is too old to be tested: skyless flash brings the present one.")
         self._settings = (await self._ask(link.ASK_TAG_CONFIG, b"", link.TagConfig)).settings
@@ -280,7 +280,7 @@ class Bench:
     def send_frame(self, number: int) -> None:
         """Send a numbered frame some milliseconds from now."""
         now_ticks = self._clock.read(time.monotonic())
-        if now_ticks is None:
+        if now_ticks is None or not self.facts.can_transmit:
             return
         body = _FRAME + number.to_bytes(4, "little") + bytes(range(FRAME_BYTES - len(_FRAME) - 6))
         dx_ticks = wrap(now_ticks + from_seconds(_LEAD_S))
