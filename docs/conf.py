@@ -56,6 +56,7 @@ NAVIGATION = {
         "docs/howto/board_tag",
         "docs/howto/container",
         "docs/board",
+        "docs/first_day",
         "docs/hardware",
         "firmware/README",
         "docs/extend",

@@ -20,7 +20,7 @@ CHIP_HZ: Final = (2_000_000, 8_000_000)
 PATTERN: Final = bytes.fromhex("a55a00ff")
 FRAME_BYTES: Final = 100
 OTP_WORDS: Final = {
-    "part": 0x06, "lot": 0x07, "ldo_tune": 0x04, "voltage": 0x08, "temperature": 0x09, "tx_power": 0x12,
+    "part": 0x06, "lot": 0x07, "ldo_tune": 0x04, "voltage": 0x08, "temperature": 0x09, "tx_power": 0x19,
     "antenna_delay": 0x1C, "crystal_trim": 0x1E,
 }  # fmt: skip
 """Words of the one-time programmable memory that are read (DW1000 User Manual v2.12, table 10)."""
