@@ -90,7 +90,7 @@ def test_the_commands_give_the_fixes_that_their_classes_give(kind, tmp_path, cap
             is_anchor = node in self.anchors
             words = ["anchor", node.name, "--site", file] if is_anchor else ["tag", node.name, "--json"]
             words += [] if is_anchor else ["--publish-hz", "1000"]
-            program()([*map(str, words), "--radio", f"serial:{node.wire.path}", "--mqtt", "none"])
+            program()([*map(str, words), "--radio", f"serial:{node.wire.path}@1000000", "--mqtt", "none"])
             node.task = asyncio.ensure_future(given.pop())
 
     site = load_site(file)

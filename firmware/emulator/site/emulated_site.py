@@ -238,7 +238,7 @@ class EmulatedSite:
     def start_host(self, node: SiteNode) -> None:
         """Start the program of a node."""
         kind: Literal["anchor", "tag"] = "anchor" if node in self.anchors else "tag"
-        (real,) = open_radios(f"serial:{node.wire.path}", kind, (node.name,), [node.delays])
+        (real,) = open_radios(f"serial:{node.wire.path}@1000000", kind, (node.name,), [node.delays])
         radio = WatchedRadio(real, self._lead_s)
         node.radios.append(radio)
         if node in self.anchors:
