@@ -10,10 +10,12 @@
 static uint32_t offset_us; /* of the time to TIMER0's count */
 static bool is_slow_counting;
 
-/* Anomaly 87: a flag of the floating-point unit would end each sleep at once. */
+/* Anomaly 87: a flag of the floating-point unit, or its interrupt, would end each sleep at once. */
 static void wait_for_event(void)
 {
-    __asm volatile("vmsr fpscr, %0\n\tdsb\n\twfi" : : "r"(0) : "memory");
+    __asm volatile("vmsr fpscr, %0" : : "r"(0));
+    NVIC_ICPR1 = FPU_IRQ_IN_ICPR1;
+    __asm volatile("dsb\n\twfi" ::: "memory");
 }
 
 static void start_crystal(void)
@@ -67,6 +69,8 @@ static void start_slow_counter(void)
 {
     RTC1_STOP = 1u;
     RTC1_CLEAR = 1u;
+    while (RTC1_COUNTER != 0u) { /* it is cleared up to 46 us later (PS 25) */
+    }
     RTC1_START = 1u;
     is_slow_counting = true;
 }
@@ -110,6 +114,7 @@ void clock_sleep_ms(uint32_t milliseconds)
     start_crystal();
     passed += (RTC1_COUNTER - (uint32_t)passed) & COUNTER_MASK;
     RTC1_STOP = 1u;
+    RTC1_INTENCLR = RTC_INT_COMPARE0;
     is_slow_counting = false;
     TIMER0_CLEAR = 1u; /* whatever its shutdown has left of its count */
     TIMER0_START = 1u;

@@ -21,7 +21,7 @@
 #define RESETREAS_PIN 0x01u
 
 /* Revisions 1 to 3 are 5 to 7 here. From revision 3 on the debug port is locked at each start unless UICR and the firmware
- * both open it (PS 1.4 and Nordic's nrf52_approtect.h). */
+ * both open it (Nordic's nrf52_approtect.h). */
 #define CHIP_REVISION ((CHIP_REVISION_WORD >> 4) & 0xFu)
 #define CHIP_REVISION_WORD REGISTER(CHIP_REVISION_ADDRESS)
 #define CHIP_REVISION_ADDRESS 0xF0000FE8u
@@ -154,6 +154,7 @@
 #define RTC1_CLEAR REGISTER(0x40011008u)
 #define RTC1_COMPARE0 REGISTER(0x40011140u)
 #define RTC1_INTENSET REGISTER(0x40011304u)
+#define RTC1_INTENCLR REGISTER(0x40011308u)
 #define RTC_INT_COMPARE0 (1u << 16)
 #define RTC1_COUNTER REGISTER(0x40011504u)
 #define RTC1_CC0 REGISTER(0x40011540u)
@@ -196,6 +197,7 @@
 #define FICR_INFO_VARIANT_ADDRESS 0x10000104u
 #define UICR_PSELRESET0_ADDRESS 0x10001200u
 #define UICR_APPROTECT_ADDRESS 0x10001208u
+#define UICR_APPROTECT REGISTER(UICR_APPROTECT_ADDRESS)
 #define PIN_RESET 21u
 #define FICR_DEVICEID ((const volatile uint32_t *)0x10000060u)
 #define FICR_DEVICEADDR ((const volatile uint32_t *)0x100000A4u)
@@ -203,6 +205,8 @@
 /* System control space */
 #define NVIC_ISER0 REGISTER(0xE000E100u)
 #define NVIC_ICPR0 REGISTER(0xE000E280u)
+#define NVIC_ICPR1 REGISTER(0xE000E284u)
+#define FPU_IRQ_IN_ICPR1 (1u << 6)
 #define SCB_AIRCR REGISTER(0xE000ED0Cu)
 #define AIRCR_RESET 0x05FA0004u
 #define SCB_CPACR REGISTER(0xE000ED88u)

@@ -13,7 +13,7 @@ uint32_t startup_stack_bytes(bool used);
 
 /* Start the slow crystal, which runs some 0.25 s later. */
 void clock_start_slow(void);
-/* Periods of the slow crystal, modulo 2^24, from the first call on; 0 until it runs. */
+/* Periods of the slow crystal, modulo 2^24, from the first call after a sleep on; 0 until it runs. */
 uint32_t clock_slow_count(void);
 /* Start the fast crystal and the counter; it returns when the fast crystal runs. */
 void clock_start(void);

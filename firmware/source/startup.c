@@ -53,15 +53,33 @@ static void on_fault(void)
     }
 }
 
+/* From revision 3 on UICR must hold this value, and the firmware write it after each reset. On earlier ones every value
+ * but that of erased flash would lock the port, so the image cannot bring it. */
+static void open_debug_port(void)
+{
+    if (CHIP_REVISION < REVISION_3) {
+        return;
+    }
+    if (UICR_APPROTECT == 0xFFFFFFFFu) {
+        NVMC_CONFIG = NVMC_WRITES;
+        UICR_APPROTECT = 0xFFFFFF00u | APPROTECT_OPEN;
+        while (NVMC_READY == 0u) {
+        }
+        NVMC_CONFIG = NVMC_READS;
+        SCB_AIRCR = AIRCR_RESET; /* it counts from the next start on */
+        for (;;) {
+        }
+    }
+    APPROTECT_DISABLE = APPROTECT_OPEN;
+}
+
 void reset_handler(void)
 {
     const uint32_t *from = data_in_flash;
 
     __asm volatile("cpsid i"); /* for good: interrupts only end the processor's sleep */
     NVMC_ICACHECNF = 1u;
-    if (CHIP_REVISION >= REVISION_3) {
-        APPROTECT_DISABLE = APPROTECT_OPEN;
-    }
+    open_debug_port();
     SCB_CPACR |= CPACR_FPU;
     FPU_FPCCR = 0u; /* faults keep none of its registers: their handler has no floats */
     __asm volatile("dsb\n\tisb" ::: "memory");
@@ -95,9 +113,8 @@ __attribute__((section(".vectors"), used)) static const struct {
     IMAGE_NAME,
 };
 
-/* PSELRESET: the board's reset button. APPROTECT: the debug port stays open (with the write in `reset_handler`). A full
- * erase clears both. */
-__attribute__((section(".uicr"), used)) static const uint32_t UICR[3] = {PIN_RESET, PIN_RESET, 0xFFFFFF00u | APPROTECT_OPEN};
+/* PSELRESET: the board's reset button, which a full erase takes away. */
+__attribute__((section(".uicr"), used)) static const uint32_t UICR[2] = {PIN_RESET, PIN_RESET};
 
 /* What the compiler may call. */
 

@@ -24,7 +24,7 @@ from skyless.sim.lab import paper_lab_site
 
 FEW = Amounts(records=8, readings=40, alone_frames=10, alone_s=0.3, pair_s=1.5)
 DISTANCE_M = 1.5
-FACTS = (0x52832, 0x41414530, 0x50, 21, 0xFFFFFF5A, 12_288, 6_100)
+FACTS = (0x52832, 0x41414530, 0x50, 21, 0xFFFFFFFF, 12_288, 6_100)
 RATES = {getattr(termios, f"B{baud}"): baud for baud in (115_200, 230_400, 460_800, 1_000_000)}
 TRANSFER_S = 12e-6
 """What each transfer to the chip takes on the processor besides its bits: with that a reception takes 275 µs."""

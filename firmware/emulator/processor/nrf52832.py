@@ -44,6 +44,8 @@ _WINDOWS: Final = [
     (0xE000E000, 0x1000),
     (0xF0000000, 0x1000),
 ]
+_CONFIGURATION, _RESET_PINS = 0x10001000, 0x200
+"""UICR, and where PSELRESET is in it."""
 _PULL_UP: Final = 3
 _SPIM_START: Final = 0x40003010
 _SPIM_END: Final = 0x40003118
@@ -80,10 +82,13 @@ class Image:
         self._life = 0
         self.advertised: list[OnAir] = []
         """What has left the Bluetooth antenna."""
-        self._revision, self._configuration = revision, configuration_of(elf)
+        self._revision = revision
         self.core = Core(elf, _WINDOWS, self._read, self._write)
         self.load, self.store = self.core.load, self.core.store
-        self.settings = p.FlashPage(self, self.core.spend)
+        self.settings, self._configuration = (
+            p.FlashPage(self, self.core.spend, base) for base in (p.FlashPage.base, _CONFIGURATION)
+        )
+        self._configuration.hold(configuration_of(elf), _RESET_PINS)
         if baud is not None:
             self.settings.hold(pack(BoardSettings(baud=baud)))
         self._start(cause=0, watchdog=None)
@@ -122,8 +127,10 @@ class Image:
     @property
     def debug_is_open(self) -> bool:
         """Whether a probe can reach the processor; from revision 3 on UICR and firmware both have to open it."""
-        is_open = self._configuration[8:9] == b"\x5a" and self._clock.registers.get(0x558) == 0x5A
-        return self._revision < p.REVISION_3 or is_open
+        lock = self._configuration.registers[0x208] & 0xFF
+        if self._revision < p.REVISION_3:
+            return lock == 0xFF
+        return lock == 0x5A and self._clock.registers[0x558] == 0x5A
 
     @property
     def leds(self) -> frozenset[str]:
@@ -170,7 +177,7 @@ class Image:
         self._watchdog = watchdog or p.Watchdog(self, lambda: self._clock.is_slow_started)
         self._ppi = p.Ppi(self)
         self.settings.is_writable = False
-        self._nvmc = p.Nvmc(self, self.core.use_cache, self.settings)
+        self._nvmc = p.Nvmc(self, self.core.use_cache, self.settings, self._configuration)
         status = lambda: (self.core.hfsr, self.core.cfsr, self.core.bfar)  # noqa: E731
         self._nvic = p.Nvic(self, status, self._ask_for_reset, self.core.use_fpu)
         self._uarte = Uarte(self, self._seat.send)
@@ -192,7 +199,7 @@ class Image:
                 self._uarte,
                 self._spim,
                 p.factory_information(self, self._seat.identity),
-                p.configuration(self, self._configuration),
+                self._configuration,
                 p.identification(self, self._revision),
             )
         }

@@ -154,12 +154,6 @@ def factory_information(system: System, identity: bytes) -> Constants:
     return Constants(system, 0x10000000, words)
 
 
-def configuration(system: System, written: bytes) -> Constants:
-    """UICR from PSELRESET[0] on, as it was flashed."""
-    words = (int.from_bytes(written[at : at + 4], "little") for at in range(0, len(written), 4))
-    return Constants(system, 0x10001000, dict(zip(range(0x200, 0x20C, 4), words, strict=False)))
-
-
 REVISION_3: Final = 7
 
 
@@ -515,10 +509,12 @@ class Nvmc(Peripheral):
 
     base = 0x4001E000
 
-    def __init__(self, system: System, use_cache: Callable[[bool], None], page: "FlashPage") -> None:
+    def __init__(
+        self, system: System, use_cache: Callable[[bool], None], page: "FlashPage", configuration: "FlashPage"
+    ) -> None:
         super().__init__(system, registers=(0x400, 0x504, 0x540))  # READY, CONFIG, ICACHECNF
         self.registers[0x400] = 1
-        self._use_cache, self._page = use_cache, page
+        self._use_cache, self._page, self._configuration = use_cache, page, configuration
 
     def write(self, offset: int, value: int) -> None:
         """A store; ERASEPAGE."""
@@ -528,26 +524,26 @@ class Nvmc(Peripheral):
             raise self.unknown(offset)
         else:
             super().write(offset, value)
-            self._page.is_writable = self.registers[0x504] == 1
+            self._page.is_writable = self._configuration.is_writable = self.registers[0x504] == 1
         if offset == 0x540:
             self._use_cache(bool(value & 1))
 
 
 class FlashPage(Peripheral):
-    """The last page of the flash, for settings; it outlives resets. Writing clears bits."""
+    """A page of the flash, which outlives resets: the last one, for settings, or UICR. Writing clears bits."""
 
     base = 0x7F000
 
-    def __init__(self, system: System, wait: Callable[[int], None]) -> None:
+    def __init__(self, system: System, wait: Callable[[int], None], base: int = base) -> None:
         super().__init__(system)
-        self.is_writable = False
+        self.base, self.is_writable = base, False
         self._wait = wait
         self.registers = dict.fromkeys(range(0, 0x1000, 4), 0xFFFFFFFF)
 
-    def hold(self, data: bytes) -> None:
+    def hold(self, data: bytes, first: int = 0) -> None:
         """Contents from before the start."""
-        data += bytes(-len(data) % 4)
-        self.registers |= {at: int.from_bytes(data[at : at + 4], "little") for at in range(0, len(data), 4)}
+        words = (data[at : at + 4].ljust(4, b"\0") for at in range(0, len(data), 4))
+        self.registers |= {first + 4 * at: int.from_bytes(word, "little") for at, word in enumerate(words)}
 
     def erase(self, address: int, *, enabled: bool) -> None:
         """Set all bits."""

@@ -272,7 +272,7 @@ class LinkProtocol(BoardProtocol):
         found = {
             0x00: link.DEVICE_ID.to_bytes(4, "little"),
             link.OTP: Sensors().otp().get(sub, 0).to_bytes(4, "little"),
-            link.FACTS: struct.pack("<7I", 0x52832, 0, 5 << 4, 21, 0x5A, 12_288, 6_000),
+            link.FACTS: struct.pack("<7I", 0x52832, 0, 5 << 4, 21, 0xFFFF_FFFF, 12_288, 6_000),
             link.CLOCKS: struct.pack("<2I", us, periods) + ticks.to_bytes(5, "little"),
             link.COUNTS: struct.pack("<5I", 100, 0, 0, 275, self._tested),
         }.get(file, record[link.READ_DATA_AT :] or bytes(octets))

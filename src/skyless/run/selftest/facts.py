@@ -123,9 +123,10 @@ _SUPPLY: Final = "Measure the supply at the module; another USB port or cable."
 _PLACE: Final = "Put them 1 to 2 m apart, nothing between or beside."
 _NRF52832: Final = 0x52832
 _REVISIONS: Final = {5: 1, 6: 2, 7: 3}
-"""By what an nRF52832 states; from revision 3 on UICR has to open the debug port."""
-_OPEN_PORT: Final = (21, 0x5A)
-"""The reset pin and the lock of the debug port, as the image sets them in UICR."""
+"""By what an nRF52832 states."""
+_RESET_PIN: Final = 21
+_OPEN_PORT: Final = {1: 0xFF, 2: 0xFF, 3: 0x5A}
+"""In UICR, by the revision: the reset pin, and the value that leaves the debug port open."""
 _BAD_CAUSES: Final = link.RESET_BY_WATCHDOG | link.RESET_BY_LOCKUP | link.RESET_BY_FAULT
 _NO_LOCK: Final = 2
 """Of ``start_step``."""
@@ -188,7 +189,6 @@ def _line(name: str, board: BoardFacts) -> Check:
 def _processor(name: str, facts: tuple[int, int, int, int, int, int, int], cause: int) -> Check:
     part, _, word, reset_pin, debug, stack, used = facts
     revision, share = word >> 4 & 0xF, used / max(stack, 1)
-    needed = 2 if _REVISIONS.get(revision, 3) >= 3 else 1
     sentence, advice = "", REPORT
     if part != _NRF52832:
         sentence = f"This processor is a {part:X}, not an nRF52832."
@@ -198,7 +198,7 @@ def _processor(name: str, facts: tuple[int, int, int, int, int, int, int], cause
         sentence = f"Its firmware failed, and started again (cause {cause:#04x})."
     elif share >= 0.8:
         sentence = f"The stack was used to {100 * share:.0f} %."
-    elif (reset_pin, debug & 0xFF)[:needed] != _OPEN_PORT[:needed]:
+    elif (reset_pin, debug & 0xFF) != (_RESET_PIN, _OPEN_PORT[_REVISIONS[revision]]):
         sentence, advice = "UICR was not flashed: reset button or debug port do not work.", "skyless flash"
     found = f"nRF52832, revision {_REVISIONS.get(revision)}, stack used to {100 * share:.0f} %."
     return _check(name, fails=bool(sentence), sentence=sentence, finding=found, advice=advice)
