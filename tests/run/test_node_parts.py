@@ -22,6 +22,7 @@ from skyless.run.record import RecorderNode, _client_key, _own_name
 from skyless.run.recordings.recorder import McapFile
 from support.mqtt_brokers import stopped
 from support.processes import started
+from support.waiting import running, until
 
 pytestmark = pytest.mark.site
 
@@ -248,10 +249,8 @@ async def test_parts_stand_and_fall_together():
 
 async def test_something_is_done_again_and_again():
     done = []
-    task = asyncio.ensure_future(parts.every(0.01, lambda: done.append(1)))
-    while len(done) < 3:
-        await asyncio.sleep(0.001)
-    await stopped(task)
+    async with running(parts.every(0.01, lambda: done.append(1))):
+        await until(lambda: len(done) >= 3)
 
 
 # The loop of a program
