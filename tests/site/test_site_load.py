@@ -258,7 +258,9 @@ def test_no_file_ends_in_anything_but_a_configuration_error(tmp_path_factory, co
         load_site(path)
 
 
-TOML_VALUES = '0 -1 1 70000 1.5 nan inf 1e300 "" "x" true [] {} [[1]] 10:00:00 [{}]'.split()
+TOML_VALUES = [
+    "0", "-1", "1", "70000", "1.5", "nan", "inf", "1e300", '""', '"x"', "true", "[]", "{}", "[[1]]", "10:00:00", "[{}]",
+]  # fmt: skip
 
 
 @given(st.integers(0, 200), st.sampled_from(TOML_VALUES))
