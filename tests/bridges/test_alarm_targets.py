@@ -135,7 +135,7 @@ def test_what_waits_when_the_bridge_stops_is_tried_once_more(monkeypatch):
 
 
 @pytest.mark.site
-def test_receivers_that_hang_or_drip_cost_only_their_own_messages(monkeypatch):
+async def test_receivers_that_hang_or_drip_cost_only_their_own_messages(monkeypatch):
     monkeypatch.setattr(_deliveries, "TIMEOUT_S", 0.3)
     ended = threading.Event()
 
@@ -159,15 +159,11 @@ def test_receivers_that_hang_or_drip_cost_only_their_own_messages(monkeypatch):
         routes = [open_route(text, BridgeContext(lines.append)) for text in texts]
         hub = Hub(routes, lines.append)
         hub.on_site(SITE)
-
-        async def main():
-            async with running(*(route.target.run() for route in routes)):
-                for k in range(100):
-                    hub.on_alarm(replace(ALARM, id=f"cold/t{k}/1"))
-                await until(lambda: routes[2].target.delivered == 100)
-                await until(lambda: sum("no answer" in line for line in lines) >= 2)
-
-        asyncio.run(main())
+        async with running(*(route.target.run() for route in routes)):
+            for k in range(100):
+                hub.on_alarm(replace(ALARM, id=f"cold/t{k}/1"))
+            await until(lambda: routes[2].target.delivered == 100)
+            await until(lambda: sum("no answer" in line for line in lines) >= 2)
         ended.set()
         assert [route.target.delivered for route in routes] == [0, 0, 100]
 

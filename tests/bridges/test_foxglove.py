@@ -3,7 +3,6 @@
 import asyncio
 import json
 import os
-import socket
 import struct
 from contextlib import asynccontextmanager
 
@@ -99,18 +98,16 @@ async def client_of(server, subprotocols=SUBPROTOCOLS):
         ("evil.example", "http://evil.example", 421),
     ],
 )
-def test_pages_of_other_sites_are_refused(host, origin, status):
-    async def run():
-        async with served(origins=["https://lichtblick.example"]) as server:
-            address = f"ws://127.0.0.1:{server.port}" if host is None else f"ws://{host}:{server.port}"
-            try:
-                where = {"host": "127.0.0.1", "port": server.port}
-                async with connect(address, origin=origin, subprotocols=list(SUBPROTOCOLS), **where):
-                    return 101
-            except InvalidStatus as error:
-                return error.response.status_code
-
-    assert asyncio.run(run()) == status
+async def test_pages_of_other_sites_are_refused(host, origin, status):
+    async with served(origins=["https://lichtblick.example"]) as server:
+        address, found = f"ws://{host or '127.0.0.1'}:{server.port}", 101
+        try:
+            where = {"host": "127.0.0.1", "port": server.port}
+            async with connect(address, origin=origin, subprotocols=list(SUBPROTOCOLS), **where):
+                pass
+        except InvalidStatus as error:
+            found = error.response.status_code
+    assert found == status
 
 
 def advertised(topic):
@@ -123,27 +120,23 @@ def is_status(text):
 
 @pytest.mark.site
 @pytest.mark.parametrize("subprotocol", ["foxglove.sdk.v1", "foxglove.websocket.v1"])
-def test_a_client_gets_each_form_of_a_fix(subprotocol):
-    async def run():
-        async with served() as server, client_of(server, [subprotocol]) as client:
-            server.on_fix(FIX)  # with it the channels of its tag are there
-            await client.text(advertised("/tag/tag1/location"))
-            assert client.texts[0]["op"] == "serverInfo"
-            topics = {name: channel["id"] for name, channel in client.channels.items()}
-            wanted = [{"id": 100 + number, "channelId": number} for number in topics.values()]
-            await client.ask(op="subscribe", subscriptions=wanted)
-            found = {}
-            number, time_ns, found["/site/scene"] = await client.receive()  # at once, as it does not change
-            assert (number, time_ns) == (100 + topics["/site/scene"], round(FIX.unix_s * 1e9))
-            later = msgspec.structs.replace(FIX, unix_s=FIX.unix_s + 0.02)
-            server.on_fix(later)
-            while len(found) < len(topics):
-                number, time_ns, payload = await client.receive()
-                assert time_ns == round(later.unix_s * 1e9)
-                found[next(name for name, channel in topics.items() if channel == number - 100)] = payload
-            return client.channels, found, later
-
-    channels, found, fix = asyncio.run(run())
+async def test_a_client_gets_each_form_of_a_fix(subprotocol):
+    async with served() as server, client_of(server, [subprotocol]) as client:
+        server.on_fix(FIX)  # with it the channels of its tag are there
+        await client.text(advertised("/tag/tag1/location"))
+        assert client.texts[0]["op"] == "serverInfo"
+        topics = {name: channel["id"] for name, channel in client.channels.items()}
+        wanted = [{"id": 100 + number, "channelId": number} for number in topics.values()]
+        await client.ask(op="subscribe", subscriptions=wanted)
+        found = {}
+        number, time_ns, found["/site/scene"] = await client.receive()  # at once, as it does not change
+        assert (number, time_ns) == (100 + topics["/site/scene"], round(FIX.unix_s * 1e9))
+        fix = msgspec.structs.replace(FIX, unix_s=FIX.unix_s + 0.02)
+        server.on_fix(fix)
+        while len(found) < len(topics):
+            number, time_ns, payload = await client.receive()
+            assert time_ns == round(fix.unix_s * 1e9)
+            found[next(name for name, channel in topics.items() if channel == number - 100)] = payload
     assert msgspec.json.decode(json.dumps(found["/tag/tag1/fix"]), type=type(fix)) == fix
     x, y, z = fix.position_m
     assert found["/tf"]["translation"] == {"x": x, "y": y, "z": z}
@@ -155,7 +148,7 @@ def test_a_client_gets_each_form_of_a_fix(subprotocol):
     assert (location["latitude"], location["longitude"], location["altitude"]) == geodetic(fix.position_m, HALL)
     names = {entity["id"] for entity in found["/site/scene"]["entities"]}
     assert names == {"anchor 1", "anchor 2", "wall 0", "zone z1"}
-    for name, channel in channels.items():
+    for name, channel in client.channels.items():
         schema = json.loads(channel["schema"])
         assert (channel["encoding"], channel["schemaEncoding"]) == ("json", "jsonschema")
         assert schema["title"] == channel["schemaName"]
@@ -271,13 +264,9 @@ async def test_more_clients_than_it_serves_are_closed(monkeypatch):
 
 
 @pytest.mark.site
-async def test_a_port_in_use_is_named():
-    with socket.socket() as taken:
-        taken.bind(("127.0.0.1", 0))
-        taken.listen()
-        port = taken.getsockname()[1]
-        with pytest.raises(SkylessError, match=f"cannot listen on 127.0.0.1:{port}"):
-            await FoxgloveTarget(f"foxglove://:{port}", "127.0.0.1", port).run()
+async def test_a_port_in_use_is_named(taken):
+    with pytest.raises(SkylessError, match=f"cannot listen on 127.0.0.1:{taken}"):
+        await FoxgloveTarget(f"foxglove://:{taken}", "127.0.0.1", taken).run()
 
 
 numbers = st.integers(0, 2**32 - 1)

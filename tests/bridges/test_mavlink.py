@@ -156,18 +156,6 @@ def test_a_damaged_frame_is_dropped_and_the_next_is_read(message, data):
     assert all(one == good for one in found)
 
 
-@given(st.lists(st.binary(max_size=400), max_size=5))
-def test_no_bytes_raise_or_are_kept(pieces):
-    finder = FrameReader(CRC_EXTRAS)
-    encoder = MavlinkEncoder("px4")
-    encoder.on_site(SITE)
-    for piece in pieces:
-        for one in finder.frames(piece):
-            decoded(one)
-        encoder.on_bytes(piece, 5)
-    assert len(finder._buffer) <= 280
-
-
 def test_noise_and_damaged_frames_raise_nothing_and_are_not_kept():
     """``SKYLESS_FUZZ_FRAMES=1000000`` for a full run."""
     draw = random.Random(1)

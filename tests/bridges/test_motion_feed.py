@@ -12,6 +12,7 @@ from pymavlink.dialects.v20 import common as mavlink
 from skyless.bridges.motion_feed import MotionFeed
 from skyless.core.errors import SkylessError
 from support.processes import free_port
+from support.waiting import running, until
 
 pytestmark = pytest.mark.site
 
@@ -69,19 +70,13 @@ def test_an_address_that_is_none_is_refused(address):
         feed(address)
 
 
-def test_a_program_connects_and_goes_and_another_comes():
-    async def run():
-        motion, samples = feed(f"jsonl+tcp://127.0.0.1:{free_port()}")
-        serving = asyncio.ensure_future(motion.run())
-        while motion.server is None:
-            await asyncio.sleep(0.01)
+async def test_a_program_connects_and_goes_and_another_comes():
+    motion, samples = feed(f"jsonl+tcp://127.0.0.1:{free_port()}")
+    async with running(motion.run()):
+        await until(lambda: motion.server is not None)
         for _ in range(2):
             _, writer = await asyncio.open_connection("127.0.0.1", motion.port)
             writer.write(b'{"wheels": {"speed_mps": 1.5, "rate_rps": 0}}\n' * 3)
             await writer.drain()
             writer.close()
-        while len(samples) < 6:
-            await asyncio.sleep(0.01)
-        serving.cancel()
-
-    asyncio.run(asyncio.wait_for(run(), 60.0))
+        await until(lambda: len(samples) == 6)

@@ -3,7 +3,6 @@
 Fields and types are those of the public OpenAPI document, omlox_Hub_API_2.0.0.json.
 """
 
-import asyncio
 import json
 from datetime import datetime
 from math import dist
@@ -86,7 +85,7 @@ def test_a_trackable_is_the_same_for_ever_and_only_of_a_tag_with_a_name():
 
 
 @pytest.mark.site
-def test_a_hub_gets_batches_with_the_token_and_its_errors_are_told(tmp_path, monkeypatch):
+async def test_a_hub_gets_batches_with_the_token_and_its_errors_are_told(tmp_path, monkeypatch):
     """The stand-in refuses the first message and closes; after that it only reads."""
     monkeypatch.setattr(omlox, "_PAUSE_S", 0.01)
     token, messages, lines = tmp_path / "token", [], []
@@ -101,22 +100,19 @@ def test_a_hub_gets_batches_with_the_token_and_its_errors_are_told(tmp_path, mon
                 await connection.send('{"event": "error", "code": 10004, "description": "no"}')
                 return
 
-    async def run():
-        async with serve(hub, "127.0.0.1", 0) as server:
-            port = next(iter(server.sockets)).getsockname()[1]
-            zone = "A8C01D4C-333A-4406-B2E9-A174AD295CB1"
-            url = TargetUrl(f"omlox+ws://127.0.0.1:{port}/v2/ws/socket?zone={zone}&token_file={token}")
-            push = OmloxPush(url, BridgeContext(lines.append))
-            push.on_site(HALL)
-            for serial in range(1000):
-                push.on_fix(a_fix(serial=serial, position_m=(serial / 100, 2.0, 1.5)))
-            async with running(push.run()):
-                await until(lambda: push.dropped["refused-by-hub"])
-                push.on_fix(a_fix(position_m=(50.0, 2.0, 1.5)))
-                await until(lambda: messages[-1]["payload"][-1]["position"]["coordinates"][0] == 50.0)
-            assert push.dropped["refused-by-hub"] == 1
-
-    asyncio.run(run())
+    async with serve(hub, "127.0.0.1", 0) as server:
+        port = next(iter(server.sockets)).getsockname()[1]
+        zone = "A8C01D4C-333A-4406-B2E9-A174AD295CB1"
+        url = TargetUrl(f"omlox+ws://127.0.0.1:{port}/v2/ws/socket?zone={zone}&token_file={token}")
+        push = OmloxPush(url, BridgeContext(lines.append))
+        push.on_site(HALL)
+        for serial in range(1000):
+            push.on_fix(a_fix(serial=serial, position_m=(serial / 100, 2.0, 1.5)))
+        async with running(push.run()):
+            await until(lambda: push.dropped["refused-by-hub"])
+            push.on_fix(a_fix(position_m=(50.0, 2.0, 1.5)))
+            await until(lambda: messages[-1]["payload"][-1]["position"]["coordinates"][0] == 50.0)
+        assert push.dropped["refused-by-hub"] == 1
     assert any("error 10004: no" in line for line in lines)
     for message in messages:
         assert (message["event"], message["topic"]) == ("message", "location_updates")

@@ -88,11 +88,9 @@ async def test_more_connections_than_allowed_are_closed_at_once():
 
 
 @pytest.mark.site
-async def test_a_port_in_use_is_named():
-    with socket.create_server(("127.0.0.1", 0)) as taken:
-        port = taken.getsockname()[1]
-        with pytest.raises(SkylessError, match=f"'t:' cannot listen on 127.0.0.1:{port}: Address already in use"):
-            await TcpServer("t:", "127.0.0.1", port, list).run()
+async def test_a_port_in_use_is_named(taken):
+    with pytest.raises(SkylessError, match=f"'t:' cannot listen on 127.0.0.1:{taken}: Address already in use"):
+        await TcpServer("t:", "127.0.0.1", taken, list).run()
 
 
 @pytest.mark.site
@@ -134,10 +132,10 @@ async def test_a_pseudo_terminal_that_nobody_reads_holds_only_what_is_new(tmp_pa
     assert not link.exists()
 
 
-def test_a_path_in_the_way_of_a_link_is_named(tmp_path):
+async def test_a_path_in_the_way_of_a_link_is_named(tmp_path):
     (tmp_path / "file").write_text("keep me")
     with pytest.raises(SkylessError, match=r"'p:' has the path .*; it should be a free name"):
-        asyncio.run(PtySender("p:", str(tmp_path / "file"), print).run())
+        await PtySender("p:", str(tmp_path / "file"), print).run()
     assert (tmp_path / "file").read_text() == "keep me"
 
 
@@ -154,44 +152,32 @@ async def test_a_pseudo_terminal_and_its_link_are_there_only_while_it_runs(tmp_p
 
 
 @pytest.mark.site
-def test_a_message_longer_than_what_may_wait_reaches_a_reader_for_whom_nothing_waits():
+async def test_a_message_longer_than_what_may_wait_reaches_a_reader_for_whom_nothing_waits():
     greeting = b"x" * 200_000 + b"\n"  # a site of thousands of anchors
-
-    async def work():
-        async with running(TcpServer("t:", "127.0.0.1", 0, lambda: [greeting])) as server:
-            reader, writer = await asyncio.open_connection("127.0.0.1", await listening(server), limit=1 << 20)
-            assert await reader.readline() == greeting
-            server.send(greeting)
-            server.send(b"missed\n")
-            assert await reader.readline() == greeting
-            assert server.dropped == {"slow-reader": 1}
-            writer.close()
-
-    asyncio.run(asyncio.wait_for(work(), 30))
+    async with running(TcpServer("t:", "127.0.0.1", 0, lambda: [greeting])) as server:
+        reader, writer = await asyncio.open_connection("127.0.0.1", await listening(server), limit=1 << 20)
+        assert await reader.readline() == greeting
+        server.send(greeting)
+        server.send(b"missed\n")
+        assert await reader.readline() == greeting
+        assert server.dropped == {"slow-reader": 1}
+        writer.close()
 
 
-def test_a_serial_port_gets_bytes_once_it_is_there(tmp_path):
-    async def work():
-        said = []
-        path = tmp_path / "port"
-        async with running(SerialSender("s:", str(path), 115_200, said.append)) as sender:
-            sender.send(b"lost")
-            assert sender.dropped["no-port"] == 1
-            while not said:
-                await asyncio.sleep(0.001)
-            device = Pty(path)
-            got = bytearray()
-            device.start(got.extend)
-            while sender._write is None:
-                await asyncio.sleep(0.01)
-            sender.send(b"found")
-            while bytes(got) != b"found":
-                await asyncio.sleep(0.001)
-            assert len(said) == 1
-            assert "there is no" in said[0]
-            device.close()
-
-    asyncio.run(asyncio.wait_for(work(), 30))
+async def test_a_serial_port_gets_bytes_once_it_is_there(tmp_path):
+    said, path, got = [], tmp_path / "port", bytearray()
+    async with running(SerialSender("s:", str(path), 115_200, said.append)) as sender:
+        sender.send(b"lost")
+        assert sender.dropped["no-port"] == 1
+        await waiting.until(lambda: said)
+        device = Pty(path)
+        device.start(got.extend)
+        await waiting.until(lambda: sender._write is not None)
+        sender.send(b"found")
+        await waiting.until(lambda: bytes(got) == b"found")
+        assert len(said) == 1
+        assert "there is no" in said[0]
+        device.close()
 
 
 def test_a_stream_of_json_lines_begins_with_the_site():

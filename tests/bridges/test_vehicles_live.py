@@ -23,19 +23,14 @@ HEADING_DEG = SITE.georeference.heading_deg
 
 @contextlib.asynccontextmanager
 async def serving(address, logged=()):
-    """A target that runs and knows its site; ``logged``: what each line that it logs contains."""
+    """A target that runs for a minute at most and knows its site; ``logged``: what each line that it logs contains."""
     said = []
     target = open_route(address, BridgeContext(said.append)).target
-    async with running(target.run()):
+    async with asyncio.timeout(60), running(target.run()):
         target.on_site(SITE)
         yield target
     assert len(said) == len(logged)
     assert all(words in line for words, line in zip(logged, said, strict=True))
-
-
-def within(work):
-    """Run it, but not for ever."""
-    asyncio.run(asyncio.wait_for(work, 60))
 
 
 def bound():
@@ -129,22 +124,19 @@ def as_float32(value):
 @pytest.mark.site
 @pytest.mark.parametrize("profile", NAMES)
 @pytest.mark.parametrize("moving", [True, False])
-def test_mavsdk_decodes_every_field(profile, moving, vehicle):
+async def test_mavsdk_decodes_every_field(profile, moving, vehicle):
     fix = a_fix() if moving else a_fix(velocity_mps=None, velocity_covariance=None, hdop=None, height_known=True)
 
     logged = ["EK3_SRC1_POSZ 1"] if fix.height_known and profile == "ardupilot" else []
 
-    async def work():
-        async with serving(f"mavlink+udpout://127.0.0.1:{vehicle.port}?profile={profile}&system=3", logged) as target:
-            serial = 0
-            while not {"HEARTBEAT", NAMES[profile]} <= set(vehicle.messages):
-                serial += 1
-                target.on_second(fix.unix_s)
-                target.on_fix(structs.replace(fix, serial=serial))
-                await asyncio.sleep(0.02)
-                vehicle.connect()
-
-    within(work())
+    async with serving(f"mavlink+udpout://127.0.0.1:{vehicle.port}?profile={profile}&system=3", logged) as target:
+        serial = 0
+        while not {"HEARTBEAT", NAMES[profile]} <= set(vehicle.messages):
+            serial += 1
+            target.on_second(fix.unix_s)
+            target.on_fix(structs.replace(fix, serial=serial))
+            await asyncio.sleep(0.02)
+            vehicle.connect()
     fields = vehicle.messages[NAMES[profile]]
     assert fields.pop("from") == (3, 197)
     assert fields.pop("message_name") == NAMES[profile]
@@ -208,38 +200,32 @@ async def converse(vehicle, target):
 
 
 @pytest.mark.site
-def test_a_vehicle_on_udp():
-    async def work():
-        receiver, port = bound()
-        with receiver:
-            peers = []
-            vehicle = Played(lambda data: receiver.sendto(data, peers[-1]))
+async def test_a_vehicle_on_udp():
+    receiver, port = bound()
+    with receiver:
+        peers = []
+        vehicle = Played(lambda data: receiver.sendto(data, peers[-1]))
 
-            def read():
-                data, peer = receiver.recvfrom(1 << 16)
-                peers.append(peer)
-                vehicle.on_data(data)
+        def read():
+            data, peer = receiver.recvfrom(1 << 16)
+            peers.append(peer)
+            vehicle.on_data(data)
 
-            loop = asyncio.get_running_loop()
-            loop.add_reader(receiver, read)
-            async with serving(f"mavlink+udpout://127.0.0.1:{port}?profile=ardupilot") as target:
-                await converse(vehicle, target)
-            assert target.dropped.total() == 0
-            loop.remove_reader(receiver)
-
-    within(work())
-
-
-def test_a_vehicle_on_a_serial_line():
-    async def work():
-        line = Pty()
-        vehicle = Played(line.send)
-        line.start(vehicle.on_data)
-        async with serving(f"mavlink+serial:{line.path}@57600?profile=ardupilot") as target:
-            while vehicle.received.empty():  # until the port is open
-                target.on_second(0.0)
-                await asyncio.sleep(0.01)
+        loop = asyncio.get_running_loop()
+        loop.add_reader(receiver, read)
+        async with serving(f"mavlink+udpout://127.0.0.1:{port}?profile=ardupilot") as target:
             await converse(vehicle, target)
-        line.close()
+        assert target.dropped.total() == 0
+        loop.remove_reader(receiver)
 
-    within(work())
+
+async def test_a_vehicle_on_a_serial_line():
+    line = Pty()
+    vehicle = Played(line.send)
+    line.start(vehicle.on_data)
+    async with serving(f"mavlink+serial:{line.path}@57600?profile=ardupilot") as target:
+        while vehicle.received.empty():  # until the port is open
+            target.on_second(0.0)
+            await asyncio.sleep(0.01)
+        await converse(vehicle, target)
+    line.close()

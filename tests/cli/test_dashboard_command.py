@@ -45,13 +45,9 @@ def test_a_wrong_listening_is_refused_with_what_would_be_right(text):
         listen_address(text, PORT)
 
 
-def test_a_taken_port_is_an_error_when_it_was_asked_for():
-    with socket.socket() as other:
-        other.bind(("127.0.0.1", 0))
-        other.listen()
-        port = other.getsockname()[1]
-        with pytest.raises(SkylessError, match=f"--listen is '127.0.0.1:{port}'; another program uses this port"):
-            bind("127.0.0.1", port)
+def test_a_taken_port_is_an_error_when_it_was_asked_for(taken):
+    with pytest.raises(SkylessError, match=f"--listen is '127.0.0.1:{taken}'; another program uses this port"):
+        bind("127.0.0.1", taken)
 
 
 def test_the_next_free_port_is_taken_when_none_was_asked_for():

@@ -21,6 +21,7 @@ from skyless.run.mqtt.address import mqtt_address
 from skyless.run.mqtt.connection import Introduction, Reactions, open_connection
 from skyless.run.mqtt.link import Link
 from skyless.run.mqtt.topics import fix_topic, health_topic, status_topic
+from support.waiting import running, until
 
 pytestmark = pytest.mark.live
 
@@ -63,7 +64,7 @@ class Demo:
         self.wait_for(lambda: len(self.children()) >= 6 and Path(f"/proc/{self.process.pid}").exists())
         words = next(words for words in self.children().values() if "ether" in words)
         address = mqtt_address(words[words.index("--mqtt") + 1])
-        asyncio.run(asyncio.wait_for(until_tags_tell(address, tags), START_S))
+        asyncio.run(until_tags_tell(address, tags))
 
     def children(self):
         """Process numbers and command lines of all that it has started, and these in turn."""
@@ -93,11 +94,8 @@ async def until_tags_tell(address, tags):
     heard, link = set(), Link(address, "test", site=1, kind="watch")
     link.subscribe(fix_topic("+", "+"), lambda topic, _: heard.add(topic))
     link.subscribe(health_topic("+", "tag", "+"), lambda topic, _: heard.add(topic))
-    running = asyncio.ensure_future(link.run())
-    while len(heard) < 2 * tags:
-        await asyncio.sleep(0.05)
-    running.cancel()
-    await asyncio.gather(running, return_exceptions=True)
+    async with running(link.run()):
+        await until(lambda: len(heard) >= 2 * tags, START_S)
 
 
 def processes():
@@ -305,11 +303,11 @@ def test_the_demo_has_zones_names_a_rule_and_a_place_on_the_earth_for_other_tool
         reader.settimeout(START_S)
         reader.bind(("127.0.0.1", 0))
         bridge = ["bridge", f"nmea+udp://127.0.0.1:{reader.getsockname()[1]}", "--mqtt", broker]
-        with subprocess.Popen([*COMMAND[:-1], *bridge]) as running:
+        with subprocess.Popen([*COMMAND[:-1], *bridge]) as bridging:
             try:
                 assert reader.recv(1000).startswith(b"$GN")
             finally:
-                running.terminate()
+                bridging.terminate()
     zones = json.dumps({"zones": [{"id": "own", "name": "Own", "polygon_m": [[0, 0], [1, 0], [1, 1]]}]})
     ask(page, "/api/zones", zones.encode())
     demo.end(signal.SIGINT)

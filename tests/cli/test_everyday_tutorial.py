@@ -7,12 +7,13 @@ import shlex
 import signal
 import subprocess
 import sys
-import time
 from collections import Counter
 from pathlib import Path
 from urllib.request import Request, urlopen
 
 import pytest
+
+from support.waiting import came
 
 pytest.importorskip("duckdb")
 
@@ -21,7 +22,6 @@ PROGRAM = f"{shlex.quote(sys.executable)} -m skyless.cli.main "
 FILES = re.findall(r"as `(\w+\.\w+)`.*?^```text\n(.*?)^```", TEXT, re.DOTALL | re.MULTILINE)
 BLOCKS = re.findall(r"^```sh\n(.*?)^```", TEXT, re.DOTALL | re.MULTILINE)
 LINES = [line for block in BLOCKS for line in block.splitlines()]
-LONGEST_S = 60.0
 
 
 def run(line, folder):
@@ -31,17 +31,6 @@ def run(line, folder):
     )
     assert done.returncode == 0, f"{line}\n{done.stdout}\n{done.stderr}"
     return done.stdout
-
-
-def until(look):
-    """The first answer that is something."""
-    end = time.monotonic() + LONGEST_S
-    while time.monotonic() < end:
-        found = look()
-        if found:
-            return found
-        time.sleep(0.2)
-    raise AssertionError("it does not come")
 
 
 @pytest.mark.live
@@ -66,23 +55,23 @@ def test_every_line_of_the_tutorial_runs(tmp_path):
             except OSError:
                 return False
 
-        until(ready)
+        came(ready)
         while not others[0].startswith("skyless history"):
             line = others.pop(0).replace("http://127.0.0.1:8080", page)
             if "/alarms" in line:
-                until(lambda: get("alarms")["alarms"])
+                came(lambda: get("alarms")["alarms"])
             printed = run(line, tmp_path)
             assert not printed.startswith('{"error"')
         assert "Forklift 1" in printed  # the text view, the last of them
         assert {tag["tag"]: tag["name"] for tag in get("tags")["tags"]}["tag3"] == "Ada"
         (alarm,) = get("alarms")["alarms"]
         assert {"Forklift 1", "Forklift 2"} <= set(re.findall(r"Forklift \d", alarm["sentence"]))
-        until(lambda: get("events")["events"])
+        came(lambda: get("events")["events"])
         path = f"{page}/api/v1/alarms/{alarm['rule']}/{alarm['subject']}/acknowledge"
         body = json.dumps({"id": alarm["id"], "by": "Ada"}).encode()
         urlopen(Request(path, body, {"content-type": "application/json"}, method="POST")).close()
         kept = tmp_path / "history"
-        until(lambda: any(b"Ada" in file.read_bytes() for file in kept.rglob("EVENTS_*/msgs/*.blk")))
+        came(lambda: any(b"Ada" in file.read_bytes() for file in kept.rglob("EVENTS_*/msgs/*.blk")))
     finally:
         running.send_signal(signal.SIGINT)
         said, _ = running.communicate()

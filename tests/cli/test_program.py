@@ -4,7 +4,6 @@ import json
 import os
 import subprocess
 import sys
-import time
 from importlib.metadata import version
 from pathlib import Path
 
@@ -13,6 +12,7 @@ import pytest
 from skyless.core.site import AccuracySite
 from skyless.sim.lab import paper_lab_site
 from skyless.site.file.template import site_template
+from support.waiting import came
 
 pytestmark = pytest.mark.site
 
@@ -132,12 +132,12 @@ def test_sigterm_ends_a_command_with_all_its_processes(tmp_path):
     options = {"env": dict(os.environ), "cwd": tmp_path, "stderr": subprocess.PIPE, "start_new_session": True}
     default = ["env", "--default-signal=INT"]  # what a shell starts in the background ignores it
     process = subprocess.Popen([*default, *SKYLESS, *arguments], **options)
-    workers = until(lambda: [pid for pid in children(process.pid) if worker in words_of(pid)], 120.0)
+    workers = came(lambda: [pid for pid in children(process.pid) if worker in words_of(pid)], 120.0)
     process.terminate()
     _, told = process.communicate(timeout=60)
     assert process.returncode == 143
     assert b"Traceback" not in told
-    until(lambda: not any(worker in words_of(pid) for pid in workers))
+    came(lambda: not any(worker in words_of(pid) for pid in workers))
     assert not (tmp_path / "report").exists()
 
 
@@ -150,14 +150,6 @@ def words_of(pid):
         return Path(f"/proc/{pid}/cmdline").read_text()
     except OSError:
         return ""
-
-
-def until(found, wait_s=60.0):
-    end_s = time.monotonic() + wait_s
-    while not (result := found()):
-        assert time.monotonic() < end_s
-        time.sleep(0.05)
-    return result
 
 
 DROPPED_BY_AN_IMPORT = """

@@ -31,6 +31,7 @@ pytestmark = pytest.mark.statistical
 
 MEASURED_TIMES = {"skyless_version", "wall_s", "speed", "receptions_per_s", *MEASURED}
 ROWS = 600
+LAB = paper_lab_site(accuracy=AccuracySite())
 
 
 @pytest.fixture(scope="module")
@@ -39,7 +40,7 @@ def folder(tmp_path_factory):
     folder = tmp_path_factory.mktemp("functions")
     (folder / "anchors.csv").write_text(synthetic.anchors_csv())
     (folder / "truth.csv").write_text(synthetic.truth_csv(ROWS * 0.002 + 1.0))
-    (folder / "lab.toml").write_text(site_template(paper_lab_site(accuracy=AccuracySite())))
+    (folder / "lab.toml").write_text(site_template(LAB))
     synthetic.write(folder / "tdoa-table", "tdoa-table", ROWS)
     live_site.record(folder / "stay.mcap", live_site.messages(3.0, join_s=0.0))
     return folder
@@ -105,7 +106,7 @@ def test_functions_print_nothing_and_report_progress(folder, capsys):
     shares = {"simulate": [], "replay": [], "plan": []}
     skyless.simulate(duration_s=2.5, method="weighted", progress=shares["simulate"].append)
     skyless.replay(folder / "tdoa-table", anchors=folder / "anchors.csv", progress=shares["replay"].append)
-    skyless.plan(paper_lab_site(accuracy=AccuracySite()), step_m=1.0, progress=shares["plan"].append)
+    skyless.plan(LAB, step_m=1.0, progress=shares["plan"].append)
     assert capsys.readouterr() == ("", "")
     for name, reached in shares.items():
         assert reached == sorted(reached), name
@@ -209,14 +210,7 @@ def test_arrays_of_a_plan(results):
 
 
 def test_an_optimised_plan_has_other_anchors():
-    plan = skyless.plan(
-        paper_lab_site(accuracy=AccuracySite()),
-        step_m=2.0,
-        optimise=4,
-        search_s=0.5,
-        verify_points=1,
-        verify_rounds=100,
-    )
+    plan = skyless.plan(LAB, step_m=2.0, optimise=4, search_s=0.5, verify_points=1, verify_rounds=100)
     assert len(plan.site.anchors) == 4
     assert plan.summary["optimised"]["best"]["mean_sigma_m"] > 0.0
     assert plan.summary["verification"].points
@@ -339,11 +333,8 @@ def test_a_notebook_shows_the_figures(results, name):
 
 
 def test_a_notebook_shows_names_as_they_are():
-    result = skyless.simulate(
-        site=replace(paper_lab_site(accuracy=AccuracySite()), name="<b>hall</b> & yard"),
-        duration_s=2.2,
-        method="weighted",
-    )
+    site = replace(LAB, name="<b>hall</b> & yard")
+    result = skyless.simulate(site=site, duration_s=2.2, method="weighted")
     assert "&lt;b&gt;hall&lt;/b&gt; &amp; yard" in result._repr_html_()
     assert "<b>" not in result._repr_html_()
 
@@ -372,8 +363,8 @@ SIMULATE = [
     ({"biases": (AnchorBias(99, 1.0),)}, "99"),
     ({"site": "no.toml"}, "site is 'no.toml'; it should be a file"),
     ({"site": 3}, "site is 3; it should be a path to a file"),
-    ({"site": replace(paper_lab_site(accuracy=AccuracySite()), master=9)}, "site: master is 9; it should be"),
-    ({"site": paper_lab_site(accuracy=AccuracySite()), "scenario": "lab"}, "give either scenario or site"),
+    ({"site": replace(LAB, master=9)}, "site: master is 9; it should be"),
+    ({"site": LAB, "scenario": "lab"}, "give either scenario or site"),
     ({"scenario": "moon"}, "scenario is 'moon'; it should be one of lab, room"),
     ({"scenario": "room", "speed_mps": 2.0}, "speed_mps is for tags that walk from point to point"),
     ({"duration_s": 1}, "settle_s is 2; it should be less than duration_s, which is 1"),
@@ -384,9 +375,9 @@ SIMULATE = [
 
 def test_a_request_that_cannot_be_simulated_is_refused_as_well():
     with pytest.raises(skyless.SkylessError, match=r"positions_m\[0\] is \(3,\)"):
-        skyless.fleet_of(skyless.Request(paper_lab_site(accuracy=AccuracySite()), positions_m=((3,),)))
+        skyless.fleet_of(skyless.Request(LAB, positions_m=((3,),)))
     with pytest.raises(skyless.SkylessError, match="noise_ps is nan"):
-        skyless.fleet_of(skyless.Request(paper_lab_site(accuracy=AccuracySite()), noise_ps=float("nan")))
+        skyless.fleet_of(skyless.Request(LAB, noise_ps=float("nan")))
 
 
 REPLAY = [
@@ -394,7 +385,7 @@ REPLAY = [
     ({"anchors": "none.csv"}, "anchors is 'none.csv'; it should be a file"),
     ({"anchors": {1: (0, 0)}}, r"anchors\[1\] is \(0, 0\); it should be 3 finite numbers"),
     ({"anchors": {"a": (0, 0, 0)}}, "anchors is 'a'; it should be positions by identifiers"),
-    ({"site": paper_lab_site(accuracy=AccuracySite())}, "give either anchors or site"),
+    ({"site": LAB}, "give either anchors or site"),
     ({"truth": [[0, 1, 2]]}, r"truth is an array of shape \(1, 3\); it should be an array of shape \(n, 4\)"),
     ({"truth": [[0, 1, 2, float("nan")]]}, "all finite"),
     ({"truth": [[900, 1, 2, 1], [901, 1, 2, 1]]}, "truth: column t_s is .900.000 to 901.000.; it should be in the"),
@@ -488,7 +479,7 @@ def test_mistakes_are_named(folder, call, arguments, right):
     tables = {"file": folder / "tdoa-table", "anchors": synthetic.ANCHORS_M}
     usual = {
         skyless.replay: tables,
-        skyless.plan: {"site": paper_lab_site(accuracy=AccuracySite())},
+        skyless.plan: {"site": LAB},
         skyless.calibrate: tables,
         skyless.survey_site: {"recording": folder / "tdoa-table"},
         skyless.study: {"name": "room"},

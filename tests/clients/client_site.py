@@ -4,13 +4,13 @@ import os
 import subprocess
 import sys
 import threading
-import time
 
 import paho.mqtt.publish
 import paho.mqtt.subscribe
 
 from skyless.run.process import end_with_parent
 from support.processes import free_port
+from support.waiting import came
 
 START_S = 120.0
 
@@ -63,16 +63,8 @@ class Process:
 
     def said(self, words, limit_s=START_S):
         """Wait until it says something; the test fails if it never does."""
-        until(lambda: any(words in line for line in self.lines) or self._process.poll() is not None, limit_s)
+        came(lambda: any(words in line for line in self.lines) or self._process.poll() is not None, limit_s)
         assert any(words in line for line in self.lines), self.lines
-
-
-def until(condition, limit_s=60.0):
-    """Wait for something that should come."""
-    end_s = time.monotonic() + limit_s
-    while not condition():
-        assert time.monotonic() < end_s, f"not within {limit_s:g} s"
-        time.sleep(0.05)
 
 
 class ClientSite:

@@ -11,10 +11,11 @@ from pathlib import Path
 
 import msgspec
 import pytest
-from client_site import ORIGIN, ClientSite, Process, until
+from client_site import ORIGIN, ClientSite, Process
 
 from skyless.run.mqtt.messages import FixMessage, Zone, ZonesMessage
 from support.processes import free_port
+from support.waiting import came
 
 ENVIRONMENT = Path(__file__).parents[2] / ".venv-clients" / "homeassistant"
 PACKAGES = ("homeassistant==2025.4.4", "home-assistant-frontend==20250411.0", "paho-mqtt==2.1.0")
@@ -135,33 +136,33 @@ def test_tags_are_devices_whose_rooms_follow_the_polygons(make_home, tmp_path):
         set_zones(site, WEST, EAST)
         site.run("bridge", "homeassistant:").said("bridging")
         home = make_home(site.mqtt_port)
-        until(lambda: len(home.of_tag()) == 5)
-        until(home.has_rooms)
-        until(lambda: sorted((home.state("zone_z1"), home.state("zone_z2"))) == ["off", "on"])
-        until(lambda: home.state("accuracy") not in {"unknown", "unavailable"})
+        came(lambda: len(home.of_tag()) == 5)
+        came(home.has_rooms)
+        came(lambda: sorted((home.state("zone_z1"), home.state("zone_z2"))) == ["off", "on"])
+        came(lambda: home.state("accuracy") not in {"unknown", "unavailable"})
         assert 0.0 < float(home.state("accuracy")) < 0.5
         attributes = home.states()["skyless_1_tag1_position"]["attributes"]
         assert abs(attributes["latitude"] - ORIGIN[0]) < 1e-4
         assert attributes["gps_accuracy"] < 0.5
 
         walk(site, [1.0, 2.0, 2.99, 3.01, 2.99])
-        until(lambda: home.state("room", "walker") == "West", 5.0)
+        came(lambda: home.state("room", "walker") == "West", 5.0)
         walk(site, [3.5, 4.0, 4.0, 4.0, 4.0, 4.0])
         rooms = [json.loads(line) for line in home.lines if "skyless_1_walker_room" in line]
         known = [value["state"] for value in rooms if value["state"] not in {"unavailable", "unknown"}]
         assert known[-1] == "East"
-        until(lambda: home.state("room", "walker") == "unavailable")  # it sends no more fixes
+        came(lambda: home.state("room", "walker") == "unavailable")  # it sends no more fixes
 
         before = set(home.states())
         set_zones(site, EAST, Zone("z1", "Library", WEST.polygon_m))
-        until(lambda: home.state("room") in {"Library", "East"})
+        came(lambda: home.state("room") in {"Library", "East"})
         assert set(home.states()) == before
         set_zones(site, Zone("z1", "All", ((-9, -9), (19, -9), (19, 19), (-9, 19))))
-        until(lambda: home.state("room") == "All")
-        until(lambda: len(home.of_tag()) == 4)  # the other zone's sensor is removed
+        came(lambda: home.state("room") == "All")
+        came(lambda: len(home.of_tag()) == 4)  # the other zone's sensor is removed
 
         site.publish("homeassistant/device/skyless_1_walker/config", b"", retain=True)
-        until(lambda: home.of_tag("walker") == {})
+        came(lambda: home.of_tag("walker") == {})
 
 
 def test_a_killed_tag_is_unavailable_and_a_restarted_home_assistant_has_all_states(make_home, tmp_path):
@@ -169,30 +170,30 @@ def test_a_killed_tag_is_unavailable_and_a_restarted_home_assistant_has_all_stat
         set_zones(site, WEST, EAST)
         bridge = site.run("bridge", "homeassistant:")
         home = make_home(site.mqtt_port)
-        until(home.has_rooms)
+        came(home.has_rooms)
         before = set(home.of_tag())
 
         site.tag.kill()
-        until(lambda: set(home.of_tag().values()) == {"unavailable"}, KILLED_S)
+        came(lambda: set(home.of_tag().values()) == {"unavailable"}, KILLED_S)
         site.start_tag()
-        until(home.has_rooms)
+        came(home.has_rooms)
 
-        until(lambda: json.loads(site.retained(ZONE))["usable"])
+        came(lambda: json.loads(site.retained(ZONE))["usable"])
         status = json.loads(site.retained(CONFIG))["availability"][0]["topic"]
         home.stop()
         online = site.retained(status)
         bridge.kill()
-        until(lambda: site.retained(status) != online)
+        came(lambda: site.retained(status) != online)
         site.publish(status, online, retain=True)  # as if the bridge were there, but nothing new can come from it
         home = make_home(site.mqtt_port)
-        until(home.has_rooms)
-        until(lambda: home.state("accuracy") not in {"unknown", "unavailable"})
+        came(home.has_rooms)
+        came(lambda: home.state("accuracy") not in {"unknown", "unavailable"})
         assert set(home.of_tag()) == before
 
         bridge = site.run("bridge", "homeassistant:")
-        until(lambda: site.retained(status) != online)
+        came(lambda: site.retained(status) != online)
         bridge.kill()
-        until(lambda: set(home.of_tag().values()) == {"unavailable"}, KILLED_S)
+        came(lambda: set(home.of_tag().values()) == {"unavailable"}, KILLED_S)
         site.run("bridge", "homeassistant:")
-        until(home.has_rooms)
+        came(home.has_rooms)
         assert set(home.of_tag()) == before

@@ -11,11 +11,12 @@ from bisect import bisect
 import msgspec
 import paho.mqtt.client
 import pytest
-from client_site import ClientSite, Process, until
+from client_site import ClientSite, Process
 from paho.mqtt.enums import CallbackAPIVersion
 
 from skyless.run.mqtt.messages import TagHealth
 from support.processes import free_port
+from support.waiting import came
 
 CONFIGURATION = """
 global:
@@ -90,7 +91,7 @@ def test_rates_are_those_of_the_tag_and_the_age_of_a_killed_one_grows(tmp_path):
         site.run("bridge", f"prometheus://:{port}?hz=1000").said("bridging")
         counted, prometheus = Counted(site.mqtt_port), Prometheus(tmp_path, port)
         try:
-            until(lambda: (prometheus.value('skyless_tag_fixes_total{tag="tag1"}') or 0) > 500)
+            came(lambda: (prometheus.value('skyless_tag_fixes_total{tag="tag1"}') or 0) > 500)
             time.sleep(20.0)
             # Rates over five seconds, as Prometheus and as the tag have them, at ten times: the middle one within 5 %.
             ends = [counted.unix_s[-1] - k - 0.5 for k in range(10)]
@@ -110,15 +111,15 @@ def test_rates_are_those_of_the_tag_and_the_age_of_a_killed_one_grows(tmp_path):
 
             before = prometheus.value("skyless_tag_fixes_total")
             site.tag.kill()
-            until(lambda: prometheus.value("skyless_tag_online") == 0.0)
+            came(lambda: prometheus.value("skyless_tag_online") == 0.0)
             ages = []
-            until(lambda: (ages.append(prometheus.value("skyless_tag_fix_age_seconds")) or ages[-1]) > 8.0)
+            came(lambda: (ages.append(prometheus.value("skyless_tag_fix_age_seconds")) or ages[-1]) > 8.0)
             assert ages == sorted(ages)
-            until(lambda: prometheus.value("skyless_tag_error_std_metres") is None)
+            came(lambda: prometheus.value("skyless_tag_error_std_metres") is None)
             site.start_tag()
-            until(lambda: prometheus.value("skyless_tag_online") == 1.0)
-            until(lambda: prometheus.value("skyless_tag_fixes_total") > before + 500)
-            until(lambda: prometheus.value("skyless_tag_fix_age_seconds") < 1.0)
+            came(lambda: prometheus.value("skyless_tag_online") == 1.0)
+            came(lambda: prometheus.value("skyless_tag_fixes_total") > before + 500)
+            came(lambda: prometheus.value("skyless_tag_fix_age_seconds") < 1.0)
             assert prometheus.value("resets(skyless_tag_fixes_total[5m])") == 0.0
         finally:
             counted.stop()

@@ -12,6 +12,7 @@ from protocol1_strategies import FULL, beacons
 from skyless.core.air.almanac import AnchorPage, NoisePage
 from skyless.core.air.frame import Heard, Malformed
 from skyless.core.protocol1.beacon import Beacon, MasterTime, decode, decode_cached, encode, heard_capacity
+from support.capture_makers import tdoa2, tdoa3
 from support.frames import changed, with_fcs
 
 pytestmark = pytest.mark.site
@@ -183,23 +184,15 @@ def short_mac(sender, payload):
     return struct.pack("<HBHHH", SHORT_ADDRESSES, 7, 0xBCCF, 0xFFFF, sender) + payload
 
 
-def tdoa2(anchor):
-    stamps = [1000 * other + anchor for other in range(8)]
-    return struct.pack("<B8B8I8H", 0x22, *range(8), *stamps, *[33_000] * 8)
-
-
-def tdoa3(anchor, count):
-    head = struct.pack("<BBIB", 0x30, 42, 0xDEADBEEF, count)
-    entries = [struct.pack("<BBIH", other, 0x80 | other, 99 * other, 32_900) for other in range(count)]
-    return head + b"".join(entries) + bytes((anchor,))
-
-
+PLACE_M = (1.0, 2.0, 3.0)
+TOLD = range(8), range(3, 8000, 1000), [33_000] * 8
+RELAYS = [(other, other, 99 * other, 32_900) for other in range(6)]
 PAYLOADS = {
-    "TDoA2": tdoa2(3),
-    "TDoA2 with position": tdoa2(3) + b"\xf0\x01" + struct.pack("<fff", 1.0, 2.0, 3.0),
-    "TDoA3": tdoa3(3, 5),
-    "TDoA3 alone": tdoa3(3, 0),
-    "TDoA3 with position": tdoa3(3, 6) + b"\xf0\x01" + struct.pack("<fff", 1.0, 2.0, 3.0),
+    "TDoA2": tdoa2(*TOLD),
+    "TDoA2 with position": tdoa2(*TOLD, PLACE_M),
+    "TDoA3": tdoa3(42, 0xDEADBEEF, RELAYS),
+    "TDoA3 alone": tdoa3(42, 0xDEADBEEF, []),
+    "TDoA3 with position": tdoa3(42, 0xDEADBEEF, RELAYS, PLACE_M),
 }
 
 

@@ -15,6 +15,7 @@ from skyless.page import connections
 from skyless.page.connections import Connection, FailedAccepts, end_unfinished
 from skyless.run.web import PageLimits
 from support.processes import free_port
+from support.waiting import until
 
 pytestmark = pytest.mark.site
 
@@ -44,8 +45,7 @@ async def serving(release=None):
     app = Starlette(routes=[Route("/", at_once, methods=["GET", "POST"]), Route("/slow", slow)])
     server = uvicorn.Server(uvicorn.Config(app, http=Connection, port=free_port(), log_config=None, lifespan="off"))
     task = asyncio.create_task(server.serve())
-    while not server.started:
-        await asyncio.sleep(0.01)
+    await until(lambda: server.started)
     try:
         yield server
     finally:
@@ -102,9 +102,7 @@ async def test_beyond_the_limit_of_requests_in_work_a_client_is_told(monkeypatch
     release = asyncio.Event()
     async with serving(release) as server:
         busy = [await sent(server, SLOW) for _ in range(3)]
-        async with asyncio.timeout(20.0):
-            while len(server.server_state.connections) < 3:
-                await asyncio.sleep(0.01)
+        await until(lambda: len(server.server_state.connections) == 3)
         reader, writer = await sent(server, b"")
         refusal = await rest(reader)
         assert refusal.startswith(b"HTTP/1.1 503") and b"3 connections" + said in refusal

@@ -5,6 +5,7 @@ import shlex
 from pathlib import Path
 
 import pytest
+from test_readme import commands
 
 from skyless.bridges.target import BridgeContext
 from skyless.bridges.targets import TARGET_KINDS, open_route
@@ -15,12 +16,9 @@ PAGES = sorted((ROOT / "docs" / "tools").glob("*.md"))
 INDEX = ROOT / "docs" / "tools" / "index.md"
 
 
-def commands(page):
-    """The lines of a page's shell blocks that call the program, continued lines joined."""
-    blocks = re.findall(r"^```sh\n(.*?)^```", page.read_text(encoding="utf-8"), re.DOTALL | re.MULTILINE)
-    lines = [line for block in blocks for line in re.sub(r"\s*\\\n\s*", " ", block).splitlines()]
-    bare = [re.sub(r"(^|\s+)#\s.*", "", line).strip() for line in lines]
-    return [shlex.split(line)[1:] for line in bare if line.startswith("skyless ")]
+def own_commands(page):
+    """The lines of a page's shell blocks that call the program."""
+    return [shlex.split(line)[1:] for line in commands(page) if line.startswith("skyless ")]
 
 
 def targets(page):
@@ -32,7 +30,7 @@ def targets(page):
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
 def test_commands_are_known_to_the_program(page):
-    for command in commands(page):
+    for command in own_commands(page):
         program().parse_args(command, print_error=False, exit_on_error=False)
 
 

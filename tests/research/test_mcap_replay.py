@@ -13,10 +13,10 @@ from skyless.core.alert import Alert
 from skyless.core.integrity import IntegrityRequirement
 from skyless.core.method_names import METHODS
 from skyless.research.replays.site import SiteReplay
-from skyless.run.mqtt.messages import FixMessage, ReceptionsMessage, SegmentStart, fix_message
+from skyless.run.mqtt.messages import ReceptionsMessage, SegmentStart, fix_message
 from skyless.run.recordings.recording import McapRecording
 from skyless.site.channel import ChannelModel
-from support.live_site import PLACES, UNIX_S, messages, record
+from support.live_site import PLACES, UNIX_S, fixes_of, messages, record
 
 pytestmark = pytest.mark.site
 
@@ -47,16 +47,12 @@ def replayed_fixes(path, **options):
     return found
 
 
-def published(said):
-    return [msgspec.json.decode(payload, type=FixMessage) for _, topic, payload in said if topic.endswith("/fix")]
-
-
 @pytest.mark.parametrize("method", METHODS)
 def test_a_replay_from_the_tags_start_gives_the_live_fixes_bit_by_bit(tmp_path, method):
     path = tmp_path / "live.mcap"
     said = messages(2.5, ("a",), method, 0.0)
     record(path, said)
-    live, again = published(said), replayed_fixes(path)
+    live, again = fixes_of(said), replayed_fixes(path)
     assert len(live) > 60
     assert [
         fix_message("a", one.serial, fix, one.unix_s, one.latency_s) for one, (_, fix) in zip(live, again, strict=True)

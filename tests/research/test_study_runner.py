@@ -14,6 +14,8 @@ from skyless.core.errors import SkylessError
 from skyless.research.studies import lab
 from skyless.research.studies.picture import world_cells, world_rows
 from skyless.research.studies.runner import MEASURED, Cell, Plan, run_cells
+from support.processes import lives
+from support.waiting import came
 
 pytestmark = pytest.mark.statistical
 
@@ -120,35 +122,20 @@ def test_an_interrupt_ends_cells_that_would_last_for_minutes():
 def test_processes_end_with_the_one_that_started_them(tmp_path):
     """Killed without a word, it leaves nobody behind."""
     code = (
-        "import sys; sys.path.insert(0, sys.argv[1])\n"
+        "import sys; sys.path[:0] = sys.argv[1:]\n"
         "import test_study_runner as t\n"
         "if __name__ == '__main__': t.run_cells(t.cells(t.tell_and_rest, [1.0, 2.0]), lambda share: None, 2)\n"
     )
     script = tmp_path / "parent.py"
     script.write_text(code)
     environment = {**os.environ, "TOLD": str(tmp_path)}
-    parent = subprocess.Popen([sys.executable, str(script), str(Path(__file__).parent)], env=environment)
-    pids = wait_for(lambda: found if len(found := list(tmp_path.glob("*.pid"))) == 2 else None)
+    parent = subprocess.Popen([sys.executable, script, *Path(__file__).parents[:2]], env=environment)
+    pids = came(lambda: found if len(found := list(tmp_path.glob("*.pid"))) == 2 else None)
     parent.kill()
     parent.wait()
-    wait_for(lambda: not any(alive(int(path.stem)) for path in pids))
+    came(lambda: not any(lives(int(path.stem)) for path in pids))
 
 
 def tell_and_rest(seconds):
     (Path(os.environ["TOLD"]) / f"{os.getpid()}.pid").touch()
     time.sleep(600.0)
-
-
-def alive(pid):
-    try:
-        return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] != "Z"
-    except FileNotFoundError:
-        return False
-
-
-def wait_for(condition, patience_s=60.0):
-    end_s = time.monotonic() + patience_s
-    while not (result := condition()):
-        assert time.monotonic() < end_s, "in vain"
-        time.sleep(0.05)
-    return result

@@ -15,6 +15,7 @@ from skyless.run.tag import TagNode, TagSettings
 from skyless.sim.evaluation.scenarios import Request, impairments_of
 from skyless.sim.lab import paper_lab_site
 from skyless.sim.trajectory import Static
+from support.waiting import until
 
 LAB = paper_lab_site()
 PLACE_M = (2.0, 3.0, LAB.tags.height_m)
@@ -78,9 +79,7 @@ class LiveSite:
         return node
 
     async def until(self, true):
-        async with asyncio.timeout(90):
-            while not true():
-                await asyncio.sleep(0.02)
+        await until(true, 90.0)
 
     async def fixes(self, name, count):
         """So many further fixes; all but those of the first half second after the first."""

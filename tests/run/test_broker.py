@@ -7,8 +7,6 @@ import json
 import os
 import re
 import signal
-import time
-from pathlib import Path
 
 import msgspec
 import pytest
@@ -20,11 +18,11 @@ from skyless.core.errors import SkylessError
 from skyless.run import broker as broker_module
 from skyless.run.broker import BrokerSettings, StatedAddress, running_broker, start_broker
 from skyless.run.mqtt.address import MqttAddress, mqtt_address
-from skyless.run.mqtt.connection import check_broker
+from skyless.run.mqtt.connection import check_broker, kept_messages
 from skyless.run.mqtt.link import Link
 from support.mqtt_brokers import stopped
-from support.processes import SKYLESS, free_port, started
-from support.waiting import running, until
+from support.processes import SKYLESS, free_port, lives, started
+from support.waiting import came, running, until
 
 pytestmark = pytest.mark.site
 
@@ -41,22 +39,6 @@ def program(*options):
         yield process, json.loads(process.stdout.readline())
 
 
-def lives(pid):
-    try:
-        return Path(f"/proc/{pid}/stat").read_text(encoding="utf-8").rsplit(")", 1)[1].split()[0] != "Z"
-    except OSError:
-        return False
-
-
-def ends(pid):
-    """Whether a process is gone within ten seconds."""
-    for _ in range(1000):
-        if not lives(pid):
-            return True
-        time.sleep(0.01)
-    return False
-
-
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
 def test_it_leaves_no_orphan_however_it_ends(number, port, tmp_path):
     with program("--port", str(port), "--data", str(tmp_path / "store")) as (process, ready):
@@ -64,7 +46,7 @@ def test_it_leaves_no_orphan_however_it_ends(number, port, tmp_path):
         assert lives(ready["pid"])
         process.send_signal(number)
         assert process.wait(20) == (-9 if number == signal.SIGKILL else 0)
-        assert ends(ready["pid"])
+        came(lambda: not lives(ready["pid"]))
 
 
 def test_it_is_an_error_when_nats_server_dies(port, tmp_path):
@@ -86,30 +68,22 @@ async def test_its_store_is_private(port, tmp_path):
             await start_broker(BrokerSettings(data=tmp_path / "store"))
 
 
-async def retained_by(broker, topic, name):
-    """What a new subscriber gets of the broker at once."""
-    reader, got = Link(broker.address, name, site=7, kind="tag"), asyncio.get_running_loop().create_future()
-    reader.subscribe(topic, lambda _, payload: got.done() or got.set_result(payload))
-    async with running(reader.run()):
-        return await asyncio.wait_for(got, 20)
-
-
 async def test_retained_messages_survive_its_death(port, tmp_path):
     """Once it has written them: nats-server acknowledges a retained message some milliseconds before that."""
-    settings = BrokerSettings(port=port, data=tmp_path / "store")
+    settings, zones = BrokerSettings(port=port, data=tmp_path / "store"), "skyless/v1/7/zones"
 
     def is_written():
         return any(b"kept" in block.read_bytes() for block in settings.data.rglob("$MQTT_rmsgs/msgs/*.blk"))
 
     broker = await start_broker(settings)
     link = Link(broker.address, "t1", site=7, kind="tag")
-    link.publish("skyless/v1/7/zones", b"kept", qos=1, retain=True)
+    link.publish(zones, b"kept", qos=1, retain=True)
     async with running(link.run()):
         await until(lambda: link.connected and not link.unacknowledged and is_written())
         os.kill(broker.pid, signal.SIGKILL)
     await broker.stop()
     async with await start_broker(settings) as broker:
-        assert await retained_by(broker, "skyless/v1/7/zones", "t3") == b"kept"
+        assert await kept_messages(broker.address, [zones]) == {zones: b"kept"}
 
 
 def test_a_taken_port_is_an_error_when_it_was_asked_for(taken, tmp_path, complaint):

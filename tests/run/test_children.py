@@ -12,20 +12,12 @@ from msgspec import structs
 from skyless.run import process
 from skyless.run.process import Child, Program, end
 from support.mqtt_brokers import stopped
-from support.processes import free_port
+from support.processes import free_port, lives
 from support.waiting import until
 
 pytestmark = pytest.mark.site
 
 PYTHON = (sys.executable, "-c")
-
-
-def alive(pid):
-    try:
-        os.kill(pid, 0)
-    except ProcessLookupError:
-        return False
-    return True
 
 
 async def stop(task):
@@ -52,14 +44,14 @@ async def test_a_program_that_is_killed_is_started_again_and_logged():
     second = child.pid
     assert child.starts == 2
     assert said == ["air ended (signal 9); it wrote no message; started again"]
-    assert not alive(first)
-    assert alive(second)
+    assert not lives(first)
+    assert lives(second)
     child.restart()
     await until(lambda: child.pid not in (None, second))
-    assert (child.starts, len(said), alive(second)) == (2, 1, False)
+    assert (child.starts, len(said), lives(second)) == (2, 1, False)
     second = child.pid
     await stop(task)
-    assert not alive(second)
+    assert not lives(second)
     assert child.pid is None
 
 

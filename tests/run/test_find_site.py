@@ -19,7 +19,7 @@ from skyless.run.mqtt.topics import site_topic, status_topic
 from skyless.sim.lab import lab_site
 from support.mqtt_brokers import Embedded
 from support.processes import SKYLESS, free_port
-from support.waiting import running
+from support.waiting import running, until
 
 pytestmark = pytest.mark.site
 
@@ -47,8 +47,7 @@ async def alive(address, number, name):
     link = Link(address, "air", site=number, kind="ether")
     link.publish(*site_message(number, name), qos=1, retain=True)
     async with running(link.run()):
-        while not link.connected or link.unacknowledged:
-            await asyncio.sleep(0.01)
+        await until(lambda: link.connected and not link.unacknowledged)
         yield
 
 
@@ -72,8 +71,7 @@ async def test_a_site_of_which_nothing_is_online_is_not_chosen_though_its_number
     gone = status(1, "anchor", "1", online=False)
     await publish(broker.address, site_message(1, "lab"), gone, status(1, "dashboard", "x", online=True))
     searching = asyncio.create_task(find_site(broker.address))
-    while "site 1 'lab' was here, but none of its programs is online" not in caplog.text:
-        await asyncio.sleep(0.02)
+    await until(lambda: "site 1 'lab' was here, but none of its programs is online" in caplog.text)
     assert not searching.done()
     async with alive(broker.address, 5, "hall"):
         assert await asyncio.wait_for(searching, 20.0) == 5

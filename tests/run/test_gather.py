@@ -136,9 +136,8 @@ async def test_fixes_of_mqtt_and_of_nats_are_in_the_stream_once_and_in_order_and
 async def test_two_gathers_share_the_fixes_and_what_one_leaves_the_other_takes(tmp_path):
     """Each fix is in the stream once, under one number of its tag, whoever packed it and while one of them ends."""
     async with broker(tmp_path) as server, client_of(server.nats) as client, gathering(server.nats) as (first, _):
-        async with gathering(server.nats) as (second, _), asyncio.timeout(20):
-            while first._names is None or second._names is None:
-                await asyncio.sleep(0.02)
+        async with gathering(server.nats) as (second, _):
+            await until(lambda: first._names is not None and second._names is not None)
             for n in range(400):
                 await publish(client, f"t{n % 40}", n / 1000.0)
             await client.flush()
@@ -154,9 +153,8 @@ async def test_two_gathers_share_the_fixes_and_what_one_leaves_the_other_takes(t
         assert sorted(x for _, _, x in rows) == list(range(800))
         assert all(names[tag] == f"t{x % 40}" for _, tag, x in rows)
         assert len(set(names.values())) == len(names) == 40
-        async with gathering(server.nats, keep_bytes=10**6) as (third, _), asyncio.timeout(20):
-            while third._names is None:
-                await asyncio.sleep(0.02)
+        async with gathering(server.nats, keep_bytes=10**6) as (third, _):
+            await until(lambda: third._names is not None)
         info = await client.jetstream().stream_info(subjects.at(subjects.FIX_STREAM, SITE))
         assert info.config.max_bytes == 10**6
 
@@ -271,23 +269,19 @@ async def test_a_dashboard_reads_batches_and_names_with_the_role_of_a_page(tmp_p
         gathered = Gathered(page)
         live = LiveSite("here", "mqtt://here:1")
         live.attach(Mock(), SITE)
-        task = asyncio.ensure_future(gathered.run(LiveSites(live)))
-        async with gathering(server.nats), asyncio.timeout(20):
+        async with gathering(server.nats), running(gathered.run(LiveSites(live))), asyncio.timeout(20):
             await serving(client)
             while not gathered.columns(SITE).serial:
                 await publish(client, "a", 1.5)
                 await asyncio.sleep(0.05)
             newest, _ = gathered.columns(SITE).visible((0.0, 0.0, 9.0, 9.0), time.monotonic())
             assert newest["position_mm"][:, 0].tolist() == [1500]
-            while not live.table.fixed:
-                await asyncio.sleep(0.02)
+            await until(lambda: live.table.fixed)
             assert [*live.table.fixed] == ["a"]
             assert gathered.columns(SITE).names == {1: "a"}
         async with client_of(page) as reading:
             with pytest.raises(TimeoutError):
                 await reading.request("$JS.API.DIRECT.GET." + subjects.at(subjects.FIX_STREAM, SITE), timeout=0.5)
-        task.cancel()
-        await asyncio.gather(task, return_exceptions=True)
 
 
 async def test_more_than_the_server_has_room_for_is_refused(tmp_path):

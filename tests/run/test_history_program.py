@@ -9,6 +9,7 @@ import random
 import signal
 import time
 from collections import Counter
+from functools import partial
 from itertools import count
 from pathlib import Path
 from types import SimpleNamespace
@@ -52,14 +53,11 @@ from support.waiting import running
 from support.waiting import until as until_
 
 pytestmark = pytest.mark.site
-
-
-def until(condition, limit_s=60.0):
-    """Longer than usual: programs start here that load much."""
-    return until_(condition, limit_s)
-
+until = partial(until_, limit_s=60.0)
+"""Longer than usual: programs start here that load much."""
 
 SITE = 5
+HALL = msgspec.structs.replace(lab_site(), id=SITE)
 TAG = "ann"
 
 
@@ -155,7 +153,7 @@ async def test_fifty_kills_lose_no_acknowledged_batch_and_double_none(tmp_path):
             process.join()
         await stopped(sending)
         process = begun(stage)
-        await until(lambda: kept() >= 3 * sender.batches and len(zones()) >= sender.events, 300.0)
+        await until(lambda: kept() >= 3 * sender.batches and len(zones()) >= sender.events, limit_s=300.0)
         process.kill()
         process.join()
     assert sender.batches > 500
@@ -226,43 +224,30 @@ async def test_what_it_takes_of_a_sites_messages(tmp_path, kind):
     ended = msgspec.structs.replace(alarm, ended_unix_s=now_s + 1.0)
 
     async with Stage(tmp_path / "broker", kind) as stage:
-        publish = stage.link.publish
+        publish, retain = partial(stage.link.publish, qos=1), partial(stage.link.publish, qos=1, retain=True)
         async with keeping(stage, folder, lambda _: None) as node:
             await until(lambda: node.state().events == 1)  # the tag's own status: it has subscribed
-            lab = msgspec.structs.replace(lab_site(), id=SITE)
-            publish(topics.site_topic(SITE), SiteMessage(lab, True, now_s), qos=1, retain=True)
-            publish(topics.zones_topic(SITE), ZonesMessage((ZONE,)), qos=1, retain=True)
-            publish(
-                topics.assets_topic(SITE), AssetsMessage((Asset(TAG, "Forklift"), Asset("bob"))), qos=1, retain=True
-            )
-            publish(
-                topics.status_topic(SITE, "anchor", 3),
-                StatusMessage(True, "anchor", "3", unix_s=now_s),
-                qos=1,
-                retain=True,
-            )
-            publish(
-                topics.status_topic(SITE, "anchor", "a b"), StatusMessage(True, "anchor", "a b", unix_s=now_s), qos=1
-            )
-            publish(topics.alarm_topic(SITE, "cold", "ann"), alarm, qos=1, retain=True)
-            publish(
-                topics.zone_event_topic(SITE, "z1"),
-                ZoneEvent("z1", "door", "ann", "enter", now_s, (0.0, 0.0, 0.0)),
-                qos=1,
-            )
-            publish(topics.fix_topic(SITE, "bad"), b"{}")
+            retain(topics.site_topic(SITE), SiteMessage(HALL, True, now_s))
+            retain(topics.zones_topic(SITE), ZonesMessage((ZONE,)))
+            retain(topics.assets_topic(SITE), AssetsMessage((Asset(TAG, "Forklift"), Asset("bob"))))
+            for name, say in (("3", retain), ("a b", publish)):
+                say(topics.status_topic(SITE, "anchor", name), StatusMessage(True, "anchor", name, unix_s=now_s))
+            retain(topics.alarm_topic(SITE, "cold", "ann"), alarm)
+            entered = ZoneEvent("z1", "door", "ann", "enter", now_s, (0.0, 0.0, 0.0))
+            publish(topics.zone_event_topic(SITE, "z1"), entered)
+            stage.link.publish(topics.fix_topic(SITE, "bad"), b"{}")
             await until(lambda: (site_folder(folder, SITE) / "stream").is_dir() and node.state().events >= 4)
             await until(lambda: node.state().drops.get("wrong"))
-            publish(topics.zones_topic(SITE), b'{"zones": [{"id": "/", "name": "", "polygon_m": []}]}', qos=1)
+            publish(topics.zones_topic(SITE), b'{"zones": [{"id": "/", "name": "", "polygon_m": []}]}')
             await until(lambda: node.state().drops.get("wrong-message"))
-            publish(topics.fix_topic(SITE, TAG), numbered_fix(1))
+            stage.link.publish(topics.fix_topic(SITE, TAG), numbered_fix(1))
             await until(lambda: node.state().fixes == 1)
         async with keeping(stage, folder, lambda _: None) as node:
             while not node.state().fixes:  # nats-server may lose what comes while somebody subscribes
-                publish(topics.fix_topic(SITE, TAG), numbered_fix(2))
+                stage.link.publish(topics.fix_topic(SITE, TAG), numbered_fix(2))
                 await asyncio.sleep(0.05)
-            publish(topics.status_topic(SITE, "anchor", 3), StatusMessage(False, "anchor", "3"), qos=1, retain=True)
-            publish(topics.alarm_topic(SITE, "cold", "ann"), ended, qos=1, retain=True)
+            retain(topics.status_topic(SITE, "anchor", 3), StatusMessage(False, "anchor", "3"))
+            retain(topics.alarm_topic(SITE, "cold", "ann"), ended)
             await until(lambda: node.state().events >= 2)
     assert History(folder, SITE).assets() == {TAG: "Forklift"}
     found = [parquet.read_table(file, partitioning=None).to_pylist() for file in current_events(folder, SITE)]
@@ -283,7 +268,7 @@ async def test_what_it_takes_of_a_sites_messages(tmp_path, kind):
 
 async def test_a_recording_gives_the_rows_of_the_running_history(tmp_path):
     live, played, walk = tmp_path / "live", tmp_path / "played", tmp_path / "walk.mcap"
-    chance, lab = random.Random(7), msgspec.structs.replace(lab_site(), id=SITE)
+    chance = random.Random(7)
 
     def walked(serial):
         at_m, variances = ([chance.uniform(*limits) for _ in range(3)] for limits in ((-50.0, 50.0), (1e-6, 4.0)))
@@ -293,26 +278,22 @@ async def test_a_recording_gives_the_rows_of_the_running_history(tmp_path):
     recorder = RecorderNode(McapFile(walk), stage.broker.address, SITE, print)
     async with stage, running(recorder.run()), keeping(stage, live, print) as node:
         await until(lambda: node.state().events == 1 and recorder.recorder.kinds["status"])
-        publish, now_s = stage.link.publish, time.time()
-        publish(topics.site_topic(SITE), SiteMessage(lab, True, now_s), qos=1, retain=True)
-        publish(topics.zones_topic(SITE), ZonesMessage((ZONE,)), qos=1, retain=True)
-        publish(topics.assets_topic(SITE), AssetsMessage((Asset("t0", "Forklift"),)), qos=1, retain=True)
+        publish, retain = partial(stage.link.publish, qos=1), partial(stage.link.publish, qos=1, retain=True)
+        now_s = time.time()
+        retain(topics.site_topic(SITE), SiteMessage(HALL, True, now_s))
+        retain(topics.zones_topic(SITE), ZonesMessage((ZONE,)))
+        retain(topics.assets_topic(SITE), AssetsMessage((Asset("t0", "Forklift"),)))
         await until(lambda: recorder.recorder.kinds["assets"])
         for serial in range(1, 301):
             made = walked(serial)
-            publish(topics.fix_topic(SITE, made.tag), made)
+            stage.link.publish(topics.fix_topic(SITE, made.tag), made)
             if serial % 50 == 0:
                 event = ZoneEvent("z1", "door", made.tag, "enter", made.unix_s, made.position_m)
-                publish(topics.zone_event_topic(SITE, "z1"), event, qos=1)
-                raised = AlarmMessage(
-                    f"cold/{serial}", "cold", "Cold", "inside", "critical", made.tag, now_s, now_s, "in"
-                )
-                publish(topics.alarm_topic(SITE, "cold", made.tag), raised, qos=1, retain=True)
-                publish(
-                    topics.status_topic(SITE, "anchor", 3),
-                    StatusMessage(serial % 100 > 0, "anchor", "3", unix_s=made.unix_s),
-                    qos=1,
-                )
+                publish(topics.zone_event_topic(SITE, "z1"), event)
+                alarm = ("cold", "Cold", "inside", "critical", made.tag, now_s, now_s, "in")
+                retain(topics.alarm_topic(SITE, "cold", made.tag), AlarmMessage(f"cold/{serial}", *alarm))
+                status = StatusMessage(serial % 100 > 0, "anchor", "3", unix_s=made.unix_s)
+                publish(topics.status_topic(SITE, "anchor", 3), status)
             await asyncio.sleep(0.002)
         await until(lambda: (node.state().fixes, node.state().events) == (300, 1 + 6 + 6 + 6))
         await until(lambda: recorder.recorder.kinds["fix"] == 300 and recorder.recorder.kinds["event"] == 6)
@@ -370,8 +351,7 @@ async def test_a_broker_keeps_the_history_of_the_sites_on_it(tmp_path):
         address = MqttAddress("127.0.0.1", port, user="operator", password=read_access(access)[Role.OPERATOR])
         link, statuses = Link(address, TAG, site=SITE, kind="tag"), []
         link.subscribe(topics.status_topic(SITE, "history", "+"), lambda _, payload: statuses.append(payload), qos=1)
-        lab = msgspec.structs.replace(lab_site(), id=SITE)
-        link.publish(topics.site_topic(SITE), SiteMessage(lab, False, time.time()), qos=1, retain=True)
+        link.publish(topics.site_topic(SITE), SiteMessage(HALL, False, time.time()), qos=1, retain=True)
         task = asyncio.ensure_future(link.run())
         await until(lambda: statuses)
         serials, blocks = count(1), "stream/jetstream/*/streams/FIX_*/msgs/*.blk"

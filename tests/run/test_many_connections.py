@@ -5,6 +5,7 @@ import contextlib
 import resource
 import selectors
 import socket
+from functools import partial
 
 import pytest
 from hypothesis import given
@@ -16,8 +17,11 @@ from skyless.run import process
 from skyless.run.ether import Ether
 from skyless.sim.evaluation.scenarios import Request, impairments_of
 from skyless.sim.trajectory import Static
+from support import waiting
 
 pytestmark = pytest.mark.site
+
+until = partial(waiting.until, limit_s=60.0)
 
 MANY = 1150
 HOST = "127.0.0.1"
@@ -35,12 +39,6 @@ async def air(most=None):
     ether = Ether(LAB, {"tag1": Static(2.0, 3.0)}, impairments_of(Request(LAB), LAB), 1, most_connections=most)
     async with await ether.serve(HOST, 0, logged.append) as server:
         yield ether, server.sockets[0].getsockname()[1], logged
-
-
-async def until(true):
-    async with asyncio.timeout(60):
-        while not true():
-            await asyncio.sleep(0.01)
 
 
 async def answer(port, *, joins=True):

@@ -23,7 +23,7 @@ from skyless.run.mqtt import messages as outputs
 from skyless.run.mqtt.messages import FixMessage
 from skyless.run.recordings.recorder import McapFile
 from skyless.run.recordings.recording import McapRecording, channel_of
-from support.live_site import PLACES, SITE, UNIX_S, messages, record
+from support.live_site import PLACES, SITE, UNIX_S, fixes_of, messages, record
 
 pytestmark = pytest.mark.site
 
@@ -158,10 +158,6 @@ def test_an_ellipse_covers_two_standard_deviations():
     axes_m, yaw = ellipse_of(msgspec.structs.replace(fix, covariance_m2=tuple(covariance.ravel())))
     assert axes_m == pytest.approx((4 * 0.3, 4 * 0.1))
     assert np.tan(yaw) == pytest.approx(0.75)
-
-
-def fixes_of(said):
-    return [msgspec.json.decode(payload, type=FixMessage) for _, topic, payload in said if topic.endswith("/fix")]
 
 
 def test_a_recording_gives_back_what_was_said(whole):

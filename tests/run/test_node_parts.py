@@ -22,6 +22,7 @@ from skyless.run.record import RecorderNode, _client_key, _own_name
 from skyless.run.recordings.recorder import McapFile
 from support.mqtt_brokers import stopped
 from support.processes import started
+from support.waiting import running, until
 
 pytestmark = pytest.mark.site
 
@@ -178,16 +179,12 @@ def any_port(host):
     return port
 
 
-def test_a_port_that_is_taken_is_passed_over():
-    with socket.socket() as one:
-        one.bind((HOST, 0))
-        port = one.getsockname()[1]
-        one.listen()
-        assert not parts.is_free(HOST, port)
-        found, held = parts.reserve_next(HOST, port)
-        with held:
-            assert found > port
-        assert any_port(HOST) != port
+def test_a_port_that_is_taken_is_passed_over(taken):
+    assert not parts.is_free(HOST, taken)
+    found, held = parts.reserve_next(HOST, taken)
+    with held:
+        assert found > taken
+    assert any_port(HOST) != taken
 
 
 def test_a_port_that_was_just_left_is_free():
@@ -252,10 +249,8 @@ async def test_parts_stand_and_fall_together():
 
 async def test_something_is_done_again_and_again():
     done = []
-    task = asyncio.ensure_future(parts.every(0.01, lambda: done.append(1)))
-    while len(done) < 3:
-        await asyncio.sleep(0.001)
-    await stopped(task)
+    async with running(parts.every(0.01, lambda: done.append(1))):
+        await until(lambda: len(done) >= 3)
 
 
 # The loop of a program

@@ -53,8 +53,8 @@ BEGIN_S = 5000.0
 class Collecting:
     """An anchor's machine that keeps the stamps of what it receives, as the anchor's program does."""
 
-    def __init__(self, anchor, site=None):
-        self.machine, self.log = new_anchor(site or FRESH, anchor), StampLog(anchor, "run1")
+    def __init__(self, anchor, site):
+        self.machine, self.log = new_anchor(site, anchor), StampLog(anchor, "run1")
         self.id, self.next_transmission_ticks = anchor, self.machine.next_transmission_ticks
         self.transmission = self.machine.transmission
         self.log.request(mqtt.RequestMessage("test", (), 60.0, True), 0.0)
@@ -65,23 +65,26 @@ class Collecting:
         self.log.add(beacon.anchor, beacon.tx_ticks, reception.rx_ticks, reception.carrier_phase_cycles)
 
 
-@cache
-def messages():
-    """What the anchors publish in 12 s: times since the beginning, and messages."""
-    machines, found = {}, []
+def published(until_s, known=FRESH, **impairments):
+    """What the anchors publish, which know this site: times since the beginning, and messages."""
+    machines = {}
 
     def make(anchor):
-        machines[anchor] = Collecting(anchor)
-        return machines[anchor]
+        return machines.setdefault(anchor, Collecting(anchor, known))
 
-    errors = tuple(DelayError(anchor, float(ticks)) for anchor, ticks in DELAY_TICKS.items())
-    world = World(SITE, make, [], replace(lab_impairments(100.0), delay_errors=errors), 3)
-    for _ in world.run(12.0):
+    world = World(SITE, make, [], replace(lab_impairments(100.0), **impairments), 3)
+    for _ in world.run(until_s):
         for machine in machines.values():
             message = machine.log.collect(world.now_s, 1e9 + 1000.0 * machine.id + world.now_s)  # hosts' clocks differ
             if message is not None:
-                found.append((world.now_s, message))
-    return tuple(found)
+                yield world.now_s, message
+
+
+@cache
+def messages():
+    """Of anchors with delays, in 12 s."""
+    errors = tuple(DelayError(anchor, float(ticks)) for anchor, ticks in DELAY_TICKS.items())
+    return tuple(published(12.0, delay_errors=errors))
 
 
 def live_after(seconds, site=FRESH, facts=None, **options):
@@ -455,22 +458,11 @@ async def test_a_finding_is_logged_once_although_its_size_wavers():
 
 def test_what_phases_show_is_found_beside_what_stamps_show():
     """An anchor that moves by 5 mm, by the messages of all; the ranges stay of use."""
-    machines, shown = {}, []
-
-    def make(anchor):
-        return machines.setdefault(anchor, Collecting(anchor, SITE))
-
-    moved = AnchorDisplacement(3, x_m=0.005, from_s=14.0)
-    impairments = replace(lab_impairments(100.0), carrier=CarrierModel(), anchor_displacements=(moved,))
-    world, live = World(SITE, make, [], impairments, 3), LiveSurvey(SITE, Facts())
-    for _ in world.run(24.0):
-        now_s = BEGIN_S + world.now_s
-        for machine in machines.values():
-            message = machine.log.collect(world.now_s, 1e9 + 1000.0 * machine.id + world.now_s)
-            if message is not None:
-                live.add_stamps(msgspec.json.decode(msgspec.json.encode(message), type=mqtt.StampsMessage), now_s)
-                live.advance_watch(now_s)
-                shown.append(live.watch_message(now_s, 1e9 + world.now_s))
+    live, shown, moved = LiveSurvey(SITE, Facts()), [], AnchorDisplacement(3, x_m=0.005, from_s=14.0)
+    for t_s, message in published(24.0, SITE, carrier=CarrierModel(), anchor_displacements=(moved,)):
+        live.add_stamps(msgspec.json.decode(msgspec.json.encode(message), type=mqtt.StampsMessage), BEGIN_S + t_s)
+        live.advance_watch(BEGIN_S + t_s)
+        shown.append(live.watch_message(BEGIN_S + t_s, 1e9 + t_s))
     (finding,) = shown[-1].findings
     assert (finding.kind, finding.anchors) == ("check", (3,))
     assert finding.sentence == (

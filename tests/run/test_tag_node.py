@@ -16,7 +16,7 @@ from skyless.run import tag as tag_module
 from skyless.run.mqtt.address import MqttAddress
 from skyless.run.mqtt.messages import Counters, FixMessage, SiteMessage, TagHealth
 from skyless.run.tag import Tag, TagNode, TagSettings
-from support.waiting import running
+from support.waiting import running, until
 
 pytestmark = pytest.mark.site
 
@@ -245,6 +245,5 @@ async def test_a_link_that_fails_is_reported_of_and_started_again(monkeypatch):
 
     link = Faulty()
     async with running(process.keep(link, said.append)):
-        while link.runs < 3:
-            await asyncio.sleep(0.005)
+        await until(lambda: link.runs >= 3)
     assert "a fault" in said[0]

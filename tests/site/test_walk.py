@@ -6,6 +6,7 @@ from itertools import combinations
 
 import numpy as np
 import pytest
+import random_sites
 from msgspec.structs import replace
 
 from skyless.core.protocol1.anchor import Anchor
@@ -16,7 +17,7 @@ from skyless.sim.listening import TagSpec
 from skyless.sim.trajectory import Waypoints
 from skyless.sim.world import World
 from skyless.site.survey.legs import RelayedDifferences
-from skyless.site.survey.problem import Problem, solve_least_squares
+from skyless.site.survey.problem import solve_least_squares
 from skyless.site.survey.walk import TAG_STD_M, EpochCollector, TagEpochs, WalkRows, fit_with_tag, tag_ranges
 from support.alignment import aligned_errors_m
 from support.bench import LAB, ROOM
@@ -29,7 +30,6 @@ ROOM_M = np.array(
 HALL_M = np.array([(x, y, 6.0) for y in (0, 12, 24) for x in (0, 12, 24, 36)])
 HALL_M[:, :2] += np.random.default_rng(8).uniform(-1.0, 1.0, (12, 2))
 HALL_M[:, 2] += np.random.default_rng(9).uniform(-0.3, 0.3, 12)
-NONE = np.zeros(0, dtype=np.int64)
 
 
 def problem_of(rng, positions_m, planar, range_std_m=RANGE_STD_M, delay_std_m=DELAY_STD_M):
@@ -39,12 +39,9 @@ def problem_of(rng, positions_m, planar, range_std_m=RANGE_STD_M, delay_std_m=DE
     delay_m = rng.normal(0.0, delay_std_m, n)
     distance_m = np.linalg.norm(positions_m[first] - positions_m[second], axis=1)
     range_m = distance_m + delay_m[first] + delay_m[second] + rng.normal(0.0, range_std_m, len(first))
-    is_free = np.ones((n, 3), dtype=bool)
-    is_free[:, 2] = not planar
-    variances = np.full(len(first), range_std_m**2), np.full(n, delay_std_m**2)
-    known = np.zeros((n, 3)), np.full((n, 3), np.inf)
-    nothing = np.zeros(0)
-    return Problem(is_free, first, second, range_m, *variances, *known, NONE, NONE, nothing, nothing), delay_m
+    stds_m = {"delay_std_m": delay_std_m, "std_m": range_std_m}
+    axes = {"dimensions": 2 if planar else 3, "heights": 0.0}
+    return random_sites.problem_of(positions_m, first, second, range_m, **axes, **stds_m), delay_m
 
 
 def path_of(rng, positions_m, epochs, height_m):

@@ -7,7 +7,7 @@ from skyless.core.any_receiver import AnyReceiver
 from skyless.core.integrity import IntegrityRequirement
 from skyless.core.site import GeoreferenceSite
 from skyless.run.mqtt import topics
-from skyless.run.mqtt.messages import RequestMessage, SiteMessage, TrueMotion, TruthMessage, fix_message
+from skyless.run.mqtt.messages import FixMessage, RequestMessage, SiteMessage, TrueMotion, TruthMessage, fix_message
 from skyless.run.recordings.reception_log import ReceptionLog, receiver_settings
 from skyless.run.recordings.recorder import McapFile, McapRecorder
 from support.bench import LAB, tape
@@ -51,6 +51,10 @@ def _of_tag(tag, seconds, method, join_s, publish_every, integrity, faults):
     log.interrupt()
     while (raw := log.collect(seconds, UNIX_S)) is not None:
         yield UNIX_S + seconds, topics.receptions_topic(SITE.id, tag), raw
+
+
+def fixes_of(said):
+    return [msgspec.json.decode(payload, type=FixMessage) for _, topic, payload in said if topic.endswith("/fix")]
 
 
 def record(path, said, flush_s=1.0, close=True, **options):

@@ -9,6 +9,7 @@ import socket
 import subprocess
 import sys
 import threading
+from pathlib import Path
 
 from skyless.run.hub_files import CLUSTER_PORT, LEAF_PORT, MONITOR_PORT
 from skyless.run.process import end_with_parent
@@ -55,6 +56,14 @@ def is_free_port(port, kind=socket.SOCK_STREAM):
         probe.bind(("127.0.0.1", port))
         return True
     return False
+
+
+def lives(pid):
+    """Whether there is a process with this number that has not ended."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text(encoding="utf-8").rsplit(")", 1)[1].split()[0] != "Z"
+    except OSError:
+        return False
 
 
 @contextlib.contextmanager

@@ -1,7 +1,17 @@
-"""Waiting in an event loop."""
+"""Waiting, in an event loop and without."""
 
 import asyncio
 import contextlib
+import time
+
+
+def came(value, limit_s=60.0):
+    """What a function returns, as soon as it is true; without an event loop."""
+    end_s = time.monotonic() + limit_s
+    while not (found := value()):
+        assert time.monotonic() < end_s, f"not within {limit_s:g} s"
+        time.sleep(0.02)
+    return found
 
 
 async def until(condition, limit_s=20.0):

@@ -11,6 +11,7 @@ from msgspec import Struct
 
 from skyless.bridges.target import BridgeContext, BridgedSite, Encoder, TargetUrl, floored, require_georeference
 from skyless.bridges.vehicle import Following, NewInformation, known_velocity, north_east_down
+from skyless.core.air.frame import fcs
 from skyless.core.earth import geodetic, horizontal_ellipse, rotated
 from skyless.core.errors import SkylessError
 from skyless.core.site import GeoreferenceSite
@@ -34,25 +35,9 @@ IS_SIGNED: Final = 0x01
 """The only incompatible flag defined: a signature follows the checksum."""
 
 
-def _crc_table() -> tuple[int, ...]:
-    table = []
-    for byte in range(256):
-        crc = byte
-        for _ in range(8):
-            crc = (crc >> 1) ^ (0x8408 if crc & 1 else 0)
-        table.append(crc)
-    return tuple(table)
-
-
-_CRC: Final = _crc_table()
-
-
-def crc(data: bytes, crc_extra: int) -> int:
-    """CRC-16/MCRF4XX of ``data`` followed by the byte that identifies a message's definition."""
-    value = 0xFFFF
-    for byte in data:
-        value = (value >> 8) ^ _CRC[(value ^ byte) & 0xFF]
-    return (value >> 8) ^ _CRC[(value ^ crc_extra) & 0xFF]
+def checksum(data: bytes, crc_extra: int) -> bytes:
+    """CRC-16/MCRF4XX, 802.15.4's from 0xFFFF on, of ``data`` and the byte that identifies a message's definition."""
+    return fcs(data + bytes([crc_extra]), initial=0xFFFF)
 
 
 class Frame(Struct, frozen=True):
@@ -70,7 +55,7 @@ def frame(number: int, crc_extra: int, payload: bytes, *, sequence: int, system:
     """An unsigned frame of version 2; trailing zeros of the payload are cut off, except for its first byte."""
     payload = payload.rstrip(b"\0") or payload[:1]
     body = bytes([len(payload), 0, 0, sequence & 0xFF, system, component]) + number.to_bytes(3, "little") + payload
-    return bytes([MAGIC_2]) + body + crc(body, crc_extra).to_bytes(CHECK_BYTES, "little")
+    return bytes([MAGIC_2]) + body + checksum(body, crc_extra)
 
 
 class FrameReader:
@@ -131,10 +116,8 @@ class FrameReader:
                 return None
         end = header + payload_bytes
         crc_extra = self._crc_extras.get(number)
-        if crc_extra is not None:
-            check = int.from_bytes(data[end : end + CHECK_BYTES], "little")
-            if check != crc(data[1:end], crc_extra):
-                return None
+        if crc_extra is not None and data[end : end + CHECK_BYTES] != checksum(data[1:end], crc_extra):
+            return None
         return Frame(number, system, component, data[header:end])
 
 

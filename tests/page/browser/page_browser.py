@@ -20,15 +20,6 @@ LIMIT_S = 60.0
 """A busy machine may take seconds for anything; only what never comes is an error."""
 
 
-def came(value):
-    """What a function returns, as soon as it is true."""
-    end = time.monotonic() + LIMIT_S
-    while not (found := value()):
-        assert time.monotonic() < end, "it has not come"
-        time.sleep(0.02)
-    return found
-
-
 def until(page, expression, arg=None):
     """Wait for something in the page. Playwright's own waiting needs ``eval``, which the page's policy forbids."""
     end = time.monotonic() + LIMIT_S

@@ -17,7 +17,6 @@ from pathlib import Path
 import msgspec
 import page_site as made_up
 import uvicorn
-from page_browser import came
 from starlette.applications import Starlette
 from starlette.responses import FileResponse, JSONResponse, Response
 from starlette.routing import Mount, Route, WebSocketRoute
@@ -27,6 +26,7 @@ from starlette.websockets import WebSocketDisconnect
 import skyless
 from skyless.run.site_table import THRESHOLDS
 from support.processes import free_port
+from support.waiting import came
 
 PAGE = Path(skyless.__file__).parent / "page" / "browser"
 

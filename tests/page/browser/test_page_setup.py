@@ -3,9 +3,11 @@
 import io
 
 import pytest
-from page_browser import PHONE, came
+from page_browser import PHONE
 from page_survey import TRUE, MadeUpSurvey
 from PIL import Image
+
+from support.waiting import came
 
 pytestmark = pytest.mark.statistical
 

@@ -6,11 +6,12 @@ from urllib.parse import parse_qs, urlsplit
 import msgspec
 import numpy as np
 import pytest
-from page_browser import PHONE, came
+from page_browser import PHONE
 
 from skyless.page import gathered
 from skyless.run.fix_batch import RECORD
 from skyless.sim.lab import lab_site
+from support.waiting import came
 
 pytestmark = pytest.mark.statistical
 

@@ -168,9 +168,9 @@ def air_time_s(psdu_bytes: int, preamble_symbols: int = PREAMBLE_SYMBOLS, sfd_sy
     return preamble_s(preamble_symbols, sfd_symbols) + after_rmarker_s(psdu_bytes)
 
 
-def fcs(data: bytes) -> bytes:
-    """Return the frame check sequence (clause 7.2.10): CRC-16 x¹⁶ + x¹² + x⁵ + 1, initially 0, low byte first."""
-    return crc_hqx(data.translate(_REVERSED), 0).to_bytes(2, "big").translate(_REVERSED)
+def fcs(data: bytes, initial: int = 0) -> bytes:
+    """Return the frame check sequence (clause 7.2.10): CRC-16 x¹⁶ + x¹² + x⁵ + 1, low byte first."""
+    return crc_hqx(data.translate(_REVERSED), initial).to_bytes(2, "big").translate(_REVERSED)
 
 
 def is_intact(frame: bytes) -> bool:

@@ -300,12 +300,9 @@ class ChainKeys:
     def prepare(self, interval: int) -> None:
         """Compute a few keys of the section of an interval that is needed soon."""
         if self.chain.holds(interval):
-            self._extend(interval >> SECTION_BITS, STEPS_AHEAD)
+            self._section(interval >> SECTION_BITS, STEPS_AHEAD)
 
-    def _section(self, section: int) -> list[bytes]:
-        return self._extend(section, SECTION_INTERVALS)
-
-    def _extend(self, section: int, steps: int) -> list[bytes]:
+    def _section(self, section: int, steps: int = SECTION_INTERVALS) -> list[bytes]:
         """Keys of a section, after computing at most ``steps`` of them now."""
         name = SectionName(self.chain.site, self.chain.serial, section)
         keys = self._sections.get(section)

@@ -159,7 +159,7 @@ def read_binary(stream: BufferedIOBase, drops: Drops) -> Iterator[Packet]:
     cutter = BinaryCutter(drops)
     for chunk in chunks(stream, drops):
         yield from cutter.feed(chunk)
-    yield from cutter.finish()
+    yield from cutter.feed(b"", ended=True)
 
 
 class BinaryCutter:
@@ -170,15 +170,8 @@ class BinaryCutter:
         self._buffer = b""
         self._lost = False
 
-    def feed(self, chunk: bytes) -> Iterator[Packet]:
-        """Yield the packets that this piece completes."""
-        return self._packets(chunk, ended=False)
-
-    def finish(self) -> Iterator[Packet]:
-        """Yield the packets after a false start whose length exceeds the rest of the stream."""
-        return self._packets(b"", ended=True)
-
-    def _packets(self, chunk: bytes, *, ended: bool) -> Iterator[Packet]:
+    def feed(self, chunk: bytes, *, ended: bool = False) -> Iterator[Packet]:
+        """Yield the packets that this piece completes, at the end also those after a false start too long for it."""
         for record in self._records(chunk, ended=ended):
             rx_ticks = int.from_bytes(record[1:6], "little")
             packet = decode_payload(record[_HEADER_BYTES:-_TRAILER_BYTES], None, record[6], rx_ticks)

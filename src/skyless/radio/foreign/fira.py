@@ -46,13 +46,9 @@ class DtTag:
 
     def on_info(self, info: SessionInfo, host_s: float | None = None) -> list[Packet]:
         """Packets of a decoded notification."""
-        usable = []
-        for one in info.measurements:
-            reason = _unusable(one)
-            if reason is None:
-                usable.append(one)
-            else:
-                self._drops[reason] += 1
+        reasons = [_unusable(one) for one in info.measurements]
+        self._drops.update(filter(None, reasons))
+        usable = [one for one, reason in zip(info.measurements, reasons, strict=True) if reason is None]
         if len(usable) > 1:
             first = usable[0].rx_ticks_tag
             usable.sort(key=lambda one: difference(one.rx_ticks_tag, first))

@@ -11,7 +11,7 @@ import ssl
 from collections import OrderedDict, deque
 from collections.abc import Callable, Iterable, Mapping
 from threading import Thread
-from typing import Final, cast
+from typing import Final, Self, cast
 
 from msgspec import Struct
 from paho.mqtt import client as paho
@@ -88,7 +88,9 @@ class Connection:
     paho until the socket is writable; data published while paho reads wait until it has read.
     """
 
-    def __init__(self, address: MqttAddress, tls: ssl.SSLContext | None, who: Introduction, react: Reactions) -> None:
+    def __init__(
+        self, address: MqttAddress, tls: ssl.SSLContext | None, who: Introduction, react: Reactions | None
+    ) -> None:
         self.writable = False
         """Whether the connection accepts more data; false while a slow broker's buffers are full, and once lost."""
         self.lost = asyncio.Event()
@@ -98,7 +100,7 @@ class Connection:
         """Since when, by the loop's clock, messages from the broker have waited to be read; None if none wait."""
         self._address = address
         self._keepalive_s = who.keepalive_s
-        self._react = react
+        self._react = react or Reactions()
         self._loop = asyncio.get_running_loop()
         self._client = _make_client(address, tls, who, BROKER_ANSWER_S)
         self._accepted: asyncio.Future[None] = self._loop.create_future()
@@ -111,13 +113,8 @@ class Connection:
         self._flying: dict[int, paho.MQTTMessageInfo] = {}
         self._asked: dict[int, tuple[str, ...]] = {}
 
-    async def open(self) -> None:
-        """Connect, and wait until the broker accepts.
-
-        Raises:
-            RefusedError: the broker refuses the client.
-            OSError: it cannot be reached, or does not answer (TimeoutError).
-        """
+    async def open(self) -> Self:
+        """Connect, and wait until the broker accepts; it may raise what ``open_connection`` raises."""
         try:
             async with asyncio.timeout(BROKER_ANSWER_S):
                 await _connect(self._client, self._address, max(1, self._keepalive_s // 2))
@@ -131,6 +128,7 @@ class Connection:
             raise
         self.writable = not self.lost.is_set()
         self._keep_alive()
+        return self
 
     def publish(self, topic: str, payload: bytes, qos: int, *, retain: bool) -> int:
         """Send a message, or queue it for the socket; never blocks. Returns its number for ``acknowledged``."""
@@ -313,16 +311,8 @@ async def open_connection(
     *others, last = address.brokers
     for broker in others:
         with contextlib.suppress(OSError, RefusedError):
-            return await _open(broker, tls, who, react)
-    return await _open(last, tls, who, react)
-
-
-async def _open(
-    address: MqttAddress, tls: ssl.SSLContext | None, who: Introduction, react: Reactions | None
-) -> Connection:
-    connection = Connection(address, tls, who, react or Reactions())
-    await connection.open()
-    return connection
+            return await Connection(broker, tls, who, react).open()
+    return await Connection(last, tls, who, react).open()
 
 
 async def check_broker(address: MqttAddress, tls: ssl.SSLContext | None = None) -> None:

@@ -1,5 +1,6 @@
 """Constant errors of anchors without a master: calibrated biases, antenna delays, and delays of relayed receptions."""
 
+from collections import defaultdict
 from collections.abc import Mapping
 from math import dist, log
 from typing import Final
@@ -190,7 +191,7 @@ class RelayDelays:
         """``estimate``: also estimate each anchor's own delay; otherwise a pair shares its delay equally."""
         self._anchors_m = anchors_m
         self._flights = AnchorFlights()
-        self._directions: dict[Pair, _Direction] = {}
+        self._directions: defaultdict[Pair, _Direction] = defaultdict(_Direction)
         self._excess_m: dict[Pair, RunningMedian] = {}
         self.own_m: dict[int, float] = {}
         """Each anchor's own delay, half of TX and RX together, relative to the mean."""
@@ -204,9 +205,7 @@ class RelayDelays:
 
         Stamps are unwrapped, each on its own clock.
         """
-        direction = self._directions.get((listener, sender))
-        if direction is None:
-            direction = self._directions[listener, sender] = _Direction()
+        direction = self._directions[listener, sender]
         if stated_ticks is not None and direction.skip > 0:
             direction.skip -= 1
             return direction.delay_ticks

@@ -138,18 +138,17 @@ def evidence(pairs: Pairs, weight: Array, weighted_m: Array) -> tuple[Array, Int
     delayed = incidence(n, pairs.first, pairs.second)
     products = (weight @ moved).reshape(m, n, dim)
     information, directions = np.linalg.eigh(np.einsum("pid,pie->ide", moved.reshape(m, n, dim), products))
-    is_seen = information > _MIN_INFORMATION_PER_M2
     along = np.einsum("ide,...id->...ie", directions, (weighted_m @ moved).reshape(*weighted_m.shape[:-1], n, dim))
-    of_moved = np.where(is_seen, along**2 / np.where(is_seen, information, 1.0), 0.0).sum(axis=-1)
-    of_delay, delay_seen = _scalar(weighted_m @ delayed, np.einsum("pi,pi->i", delayed, weight @ delayed))
-    of_link, link_seen = _scalar(weighted_m, np.diagonal(weight))
+    of_moved, moved_seen = _gained(along, information)
+    of_delay, delay_seen = _gained(weighted_m @ delayed, np.einsum("pi,pi->i", delayed, weight @ delayed))
+    of_link, link_seen = _gained(weighted_m, np.diagonal(weight))
     return (
-        np.concatenate([of_moved, of_delay, of_link], axis=-1),
-        np.concatenate([is_seen.sum(axis=-1), delay_seen, link_seen]).astype(np.int64),
+        np.concatenate([of_moved.sum(axis=-1), of_delay, of_link], axis=-1),
+        np.concatenate([moved_seen.sum(axis=-1), delay_seen, link_seen]).astype(np.int64),
     )
 
 
-def _scalar(along: Array, information: Array) -> tuple[Array, Mask]:
+def _gained(along: Array, information: Array) -> tuple[Array, Mask]:
     is_seen = information > _MIN_INFORMATION_PER_M2
     return np.asarray(np.where(is_seen, along**2 / np.where(is_seen, information, 1.0), 0.0)), is_seen
 

@@ -5,8 +5,9 @@ which all pairs of an anchor share. The shared part shows in two pairs bracketed
 """
 
 import math
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Callable
+from functools import partial
 from typing import Final
 
 import numpy as np
@@ -227,9 +228,9 @@ class PairRanger:
         time come in succession.
         """
         self.counters: Counter[str] = Counter()
-        self._bits, self._block_s, self._on_block = bits, block_s, on_block
+        self._block_s, self._on_block = block_s, on_block
         self._longest_ticks = min(round(_LONGEST_BRACKET_S * TICK_RATE_HZ), (1 << (bits - 1)) - 1)
-        self._clocks: dict[int, Unwrapper] = {}
+        self._clocks: defaultdict[int, Unwrapper] = defaultdict(partial(Unwrapper, bits=bits))
         self._number: dict[tuple[int, int], int] = {}
         self._open: list[tuple[int, int, int, bool, float]] = []
         self._kept = _legs_of([])
@@ -260,8 +261,8 @@ class PairRanger:
             number = self._number[pair] = len(self._number)
             self._histories.append(_History())
         self._pass_to(t_s)
-        tx = self._clock(sender).unwrap(tx_ticks, t_s)
-        rx = self._clock(receiver).unwrap(rx_ticks, t_s)
+        tx = self._clocks[sender].unwrap(tx_ticks, t_s)
+        rx = self._clocks[receiver].unwrap(rx_ticks, t_s)
         self.counters["legs"] += 1
         is_back = sender > receiver
         self._open.append((number, rx, tx, True, t_s) if is_back else (number, tx, rx, False, t_s))
@@ -318,12 +319,6 @@ class PairRanger:
             pairs.append(PairRange(a, b, mean.range_m, std_m, max(1, round(mean.exchanges)), mean.late_share))
         return PairRanges(tuple(pairs), anchors, tx_std_m, self._duration_s)
 
-    def _clock(self, anchor: int) -> Unwrapper:
-        clock = self._clocks.get(anchor)
-        if clock is None:
-            clock = self._clocks[anchor] = Unwrapper(bits=self._bits)
-        return clock
-
     def _pass_to(self, t_s: float) -> None:
         """Close the open block if its time is over. After a jump of the clock, blocks start again."""
         block, number = self._block, math.floor(t_s / self._block_s)
@@ -331,7 +326,8 @@ class PairRanger:
             if block is not None:
                 self._close_block()
             if block is None or not -_KEPT_S < t_s - self._last_s < _KEPT_S:
-                self._kept, self._clocks, self._first_s = _legs_of([]), {}, t_s
+                self._kept, self._first_s = _legs_of([]), t_s
+                self._clocks.clear()
             self._block = number
             self._last_s = t_s
         self._last_s = max(self._last_s, t_s)

@@ -417,9 +417,8 @@ def _distances_to_measure(measured: Measured, links: Links, fitted: Fitted | Non
         return ""
     placed = [index for index, fixed in zip(fitted.kept.tolist(), fitted.core, strict=True) if fixed]
     if not placed:
-        chosen = mending_tapes(surveyed_problem(fitted), fitted.solution.position_m, fitted.covariance_m2, ~fitted.core)
-        pairs = [(fitted.anchors[item.first], fitted.anchors[item.second]) for item in chosen]
-        return f"; {_advised(pairs)}" if pairs else ""
+        problem, position_m = surveyed_problem(fitted), fitted.solution.position_m
+        return _mending(fitted, problem, position_m, fitted.covariance_m2, ~fitted.core)
     pairs = []
     for anchor in anchors:
         index = measured.anchors.index(anchor)
@@ -428,7 +427,13 @@ def _distances_to_measure(measured: Measured, links: Links, fitted: Fitted | Non
         if index in fitted.kept or lacking > len(near):
             return ""
         pairs += [(anchor, measured.anchors[other]) for other in _far_apart(near, placed, fitted, lacking)]
-    return f"; {_advised(pairs)}" if pairs else ""
+    return _advised(pairs)
+
+
+def _mending(fitted: Fitted, problem: Problem, position_m: Array, covariance_m2: Array, core: Mask) -> str:
+    """Advice to measure the distances that would determine all anchors of the core."""
+    tapes = mending_tapes(problem, position_m, covariance_m2, core)
+    return _advised([(fitted.anchors[tape.first], fitted.anchors[tape.second]) for tape in tapes])
 
 
 def _far_apart(near: list[int], placed: list[int], fitted: Fitted, count: int) -> list[int]:
@@ -447,7 +452,7 @@ def _far_apart(near: list[int], placed: list[int], fitted: Fitted, count: int) -
 
 
 def _advised(pairs: list[tuple[int, int]]) -> str:
-    return f"measure {distances_named(pairs)}"
+    return f"; measure {distances_named(pairs)}" if pairs else ""
 
 
 def _held_by_expected_delays(fitted: Fitted, framed: Framed) -> tuple[str, ...]:
@@ -470,12 +475,10 @@ def _held_by_expected_delays(fitted: Fitted, framed: Framed) -> tuple[str, ...]:
     anchors = [anchor for anchor, is_one in zip(fitted.anchors, chosen, strict=True) if is_one]
     against = _axis(fitted, framed, directions)
     expected = max(_expected_m(fitted.problem, direction.delay_m) for direction in directions)
-    mending = mending_tapes(surveyed, position, covariance, fitted.core)
-    pairs = [(fitted.anchors[item.first], fitted.anchors[item.second]) for item in mending]
     return (
         f"ranges alone do not separate the antenna delays of {anchors_named(anchors)} from {against}: longer delays "
         f"look like anchors farther apart, and only the usual size of delays (±{expected:.2f} m) limits the error"
-        + (f"; {_advised(pairs)}" if pairs else ""),
+        + _mending(fitted, surveyed, position, covariance, fitted.core),
     )
 
 

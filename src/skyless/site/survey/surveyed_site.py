@@ -146,12 +146,10 @@ def _accuracy(site: Site, found: dict[int, SurveyedAnchor], range_std_m: float) 
     if not found:
         return old
     survey_std_m = old.survey_std_m
-    if site.schedule.needs_master:
+    if site.schedule.needs_master and site.anchors:
         stds_m = [found[anchor.id].std_m if anchor.id in found else None for anchor in site.anchors]
         each = [old.survey_std_m if one is None else one for one in stds_m]
-        survey_std_m = (
-            _up(math.sqrt(sum(one**2 for one in each) / len(each)), _STD_STEPS_PER_M) if each else old.survey_std_m
-        )
+        survey_std_m = _up(math.sqrt(sum(one**2 for one in each) / len(each)), _STD_STEPS_PER_M)
     return replace(
         old,
         survey_std_m=survey_std_m,
