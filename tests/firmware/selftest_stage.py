@@ -17,7 +17,7 @@ from msgspec.structs import replace
 from skyless.core.ticks import TICK_S
 from skyless.radio.serial.link import BoardSettings, pack
 from skyless.run.selftest.facts import judge
-from skyless.run.selftest.measure import Amounts, Bench, measure
+from skyless.run.selftest.measure import Amounts, Bench, measure, report_of
 from skyless.sim.dw1000 import registers as r
 from skyless.sim.dw1000.chip import Sensors
 from skyless.sim.lab import paper_lab_site
@@ -36,6 +36,8 @@ class Fault(Struct, frozen=True, kw_only=True):
     carries: int = 1_000_000
     """Highest rate that the ports carry."""
     baud: int = 460_800
+    tag: bool = False
+    """It is a tag that sleeps and writes JSON."""
     facts: tuple[int, ...] = FACTS
     cause: int = 0
     slow_hz: float = 32_768.0
@@ -61,7 +63,7 @@ class FaultyBoard(HostBoard):
         self.slow_hz = fault.slow_hz * (1.0 + 1e-6 * generator.uniform(-60.0, 60.0))
         self.baud = 0
         self.reset_cause = fault.cause
-        self.settings = pack(BoardSettings(baud=fault.baud)) + b"\0\0"
+        self.settings = pack(BoardSettings(baud=fault.baud, mode=fault.tag, output=2, sleep_ms=5000)) + b"\0\0"
         super().__init__(seat)
 
     def now_us(self):
@@ -84,7 +86,7 @@ class FaultyBoard(HostBoard):
     def set_rate(self, baud):
         """After what waits has left."""
         self.process.sleep(max(self._unsent_ticks - self._timeline.now_ticks, 0) * TICK_S + 1e-6)
-        self.baud = baud
+        self.baud, self.byte_s = baud, 10.0 / baud
 
     def noise(self, wire):
         """What becomes of bytes on the line: nothing where the rates differ, and some are damaged above its limit."""
@@ -105,7 +107,7 @@ class FaultyBoard(HostBoard):
 class Pair(EmulatedSite):
     """Both boards without programs; the first has the fault."""
 
-    def __init__(self, fault=None, seed=1, boards=2, image=False):
+    def __init__(self, fault=None, seed=1, boards=2, image=False, other=None):
         self.fault, self.random = fault or Fault(), random.Random(seed)
         lab = paper_lab_site()
         delays = [16_436 + self.fault.delay_ticks + round(self.random.gauss(0.0, 40.0)) for _ in range(4)]
@@ -117,7 +119,7 @@ class Pair(EmulatedSite):
             for n in range(2)
         )  # fmt: skip
         noise = replace(lab.noise, tx_stamp_ps=self.fault.stamp_ps, rx_stamp_ps=self.fault.stamp_ps)
-        self.faults, self.image = iter((self.fault, Fault())), image
+        self.faults, self.image = iter((self.fault, other or Fault())), image
         site, wire = replace(lab, anchors=anchors, noise=noise), WireSettings(piece_bytes=128)
         super().__init__(site, [], self.make, seed=seed, wire=wire)
         self.boards = boards
@@ -165,7 +167,8 @@ class Pair(EmulatedSite):
         async def whole():
             async with self:
                 benches = [Bench(name, node.wire.path) for name, node in zip("AB", self.nodes, strict=True)]
-                return await measure(benches[: self.boards], DISTANCE_M, amounts)
+                await measure(benches[: self.boards], amounts)
+                return report_of(benches[: self.boards], DISTANCE_M)
 
         return run_on(self.medium.timeline, whole())
 

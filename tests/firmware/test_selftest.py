@@ -85,6 +85,33 @@ def test_sound_boards_pass(seed):
     assert len(judge(report)) == 28
 
 
+@pytest.mark.parametrize("baud", [115_200, 1_000_000])
+def test_a_tag_that_sleeps_passes_at_its_own_rate_and_has_its_settings_again(baud):
+    pair = Pair(Fault(baud=baud, tag=True))
+    assert sentences(pair.test(replace(FEW, records=40))) == []
+    assert pair.nodes[0].board.baud == baud
+
+
+def test_a_pair_whose_boards_need_other_rates_than_their_own_keeps_them_until_the_end():
+    found = sentences(Pair(Fault(carries=460_800, baud=1_000_000), other=Fault(carries=230_400)).test())
+    assert len(found) == 2
+    assert all("This port carries" in one for one in found)
+
+
+def test_a_board_that_falls_silent_while_frames_are_sent_is_named_and_not_the_other():
+    pair = Pair()
+    receive = pair.nodes[1].chip.receive
+
+    def silence(*words, **more):
+        receive(*words, **more)
+        pair.nodes[1].wire.noise_to_host = lambda data: b""
+
+    pair.nodes[1].chip.receive = silence
+    report = pair.test()
+    assert [bool(board.trouble) for board in report.boards] == [False, True]
+    assert "ok" not in {check.result for check in judge(report) if check.name in ("board B", "pair")}
+
+
 @needs_processor
 @pytest.mark.statistical
 def test_the_image_on_emulated_processors_passes():

@@ -11,8 +11,6 @@ from emulator.seat import Seat
 from emulator.site.host_programs import Process
 from skyless.core.ticks import TICK_S, from_seconds
 
-BYTE_S: Final = 10e-6
-"""On the UART: ten bits at 1 Mbaud."""
 LINE_BYTES: Final = 1024
 """Bytes that wait to be sent, or to be read."""
 SLOW_HZ: Final = 2_000_000
@@ -27,6 +25,8 @@ class HostBoard(Processor):
     """One board; its program is run again after the supply failed."""
 
     reset_cause = 0
+    byte_s = 10e-6
+    """On the UART: ten bits at 1 Mbaud."""
 
     def __init__(self, seat: Seat) -> None:
         self._seat, self._timeline, self.chip = seat, seat.timeline, seat.chip
@@ -123,9 +123,9 @@ class HostBoard(Processor):
         """Send, now or when what waits is sent; False where it does not fit."""
         now = self._timeline.now_ticks
         begins = max(now, self._unsent_ticks)
-        if (begins - now) * TICK_S / BYTE_S + len(data) > LINE_BYTES:
+        if (begins - now) * TICK_S / self.byte_s + len(data) > LINE_BYTES:
             return False
-        self._unsent_ticks = begins + from_seconds(len(data) * BYTE_S)
+        self._unsent_ticks = begins + from_seconds(len(data) * self.byte_s)
         self._timeline.at(self._unsent_ticks, partial(self._deliver, data, self.process))
         return True
 

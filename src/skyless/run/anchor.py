@@ -42,11 +42,12 @@ MAX_MOVE_M: Final = 0.5
 """How far a survey may move an anchor with keys from its place in the site file: its codes vouch for the place."""
 
 MAX_LEAD_S: Final = 8e-3
+MAX_LEAD_RATIO: Final = 1.6
 LEAD_GAIN: Final = 1.25
 LEAD_LOSS: Final = 0.998
 """The lead is the time between handing over a frame and its RMARKER. It begins with the radio's ``lead_s``, grows by
-the gain with each late frame, up to the maximum, and shrinks by the loss with each frame sent. A longer lead makes
-relayed stamps older."""
+the gain with each late frame, up to the maximum or that multiple of the radio's, and shrinks by the loss with each
+frame sent. A longer lead makes relayed stamps older."""
 
 ASK_AGAIN_S: Final = 5e-3
 LOST_ANSWER_S: Final = 0.25
@@ -175,7 +176,7 @@ class AnchorNode:
         elif isinstance(event, Late):
             self.late += 1
             self.transmissions.missed += 1
-            self.lead_s = min(self.lead_s * LEAD_GAIN, MAX_LEAD_S)
+            self.lead_s = min(self.lead_s * LEAD_GAIN, max(MAX_LEAD_S, MAX_LEAD_RATIO * self.radio.lead_s))
             self._wait(ASK_AGAIN_S, self._schedule)
         elif not isinstance(event, Reported):
             self.monitor.on_event(event)

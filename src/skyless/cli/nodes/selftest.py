@@ -22,7 +22,7 @@ from skyless.core.errors import SkylessError
 from skyless.radio.serial.serial_port import check_path
 from skyless.run.process import run
 from skyless.run.selftest.facts import Report, judge
-from skyless.run.selftest.measure import Bench, measure
+from skyless.run.selftest.measure import Bench, measure, report_of
 
 app = App(
     name="selftest",
@@ -80,17 +80,24 @@ def _test(asked: SelftestOptions) -> Report:
     if asked.report is not None:
         check_folder("--report", asked.report)
         check_new(asked.report, force=asked.force)
-    reports: list[Report] = []
+    benches: list[Bench] = []
+    is_whole = False
 
     async def work() -> None:
-        benches = [Bench(name, path) for name, path in zip("AB", paths, strict=False)]
-        reports.append(await measure(benches, asked.separation, reach=log))
+        nonlocal is_whole
+        benches.extend(Bench(name, path) for name, path in zip("AB", paths, strict=False))
+        await measure(benches, reach=log)
+        is_whole = True
 
-    run(work(), punctual=True)
-    (report,) = reports
-    if asked.report is not None:
-        write_file(asked.report, to_json(report).encode())
-        say_written(asked.report)
+    try:
+        run(work(), punctual=True)
+    finally:
+        for bench in benches if not is_whole else ():
+            bench.facts.trouble = bench.facts.trouble or "The test was interrupted."
+        report = report_of(benches, asked.separation)
+        if asked.report is not None and benches:
+            write_file(asked.report, to_json(report).encode())
+            say_written(asked.report)
     return report
 
 

@@ -105,8 +105,8 @@ class LineQuality:
     """Shares of spoilt records on the line from a board."""
 
     def __init__(self) -> None:
-        self.sound = self.spoilt = 0
-        """Records since the session's begin."""
+        self.sound = self.spoilt = self.unsent = 0
+        """Records since the session's begin; unsent ones are those that the board's line had no room for."""
         self._before: deque[tuple[int, int]] = deque([(0, 0)], maxlen=round(_LINE_S / STATUS_S))
         self._reported = 0.0
 
@@ -114,7 +114,7 @@ class LineQuality:
         """The share of the last seconds, if it should be reported: it is bad, and so bad for the first time."""
         sound, spoilt = self.sound - self._before[0][0], self.spoilt - self._before[0][1]
         self._before.append((self.sound, self.spoilt))
-        share = spoilt / max(sound + spoilt, 1)
+        share = max(spoilt, 0) / max(sound + spoilt, 1)
         level = max((limit for limit in (NOTABLE_SHARE, SPOILT_SHARE) if share >= limit), default=0.0)
         if len(self._before) < _LINE_POLLS or spoilt < _MIN_SPOILT or level <= self._reported:
             return None
@@ -124,7 +124,7 @@ class LineQuality:
     @property
     def share(self) -> float:
         """The share since the session's begin."""
-        return self.spoilt / max(self.sound + self.spoilt, 1)
+        return max(self.spoilt, 0) / max(self.sound + self.spoilt, 1)
 
 
 class LinkSession:
@@ -166,7 +166,7 @@ class LinkSession:
         self._refused = self._reported = ""
         self._heard_s = self._asked_s = 0.0
         self._starts: deque[float] = deque(maxlen=_MAX_STARTS)
-        self._reported_starts = self._reported_idle = self._reported_line = False
+        self._reported_starts = self._reported_idle = self._reported_line = self._reported_full = False
         self._idle_polls = 0
 
     def begin(self, host_s: float) -> None:
@@ -197,6 +197,11 @@ class LinkSession:
                 text = f"the board at {self._port} answers, but does not start to receive: does its radio work?"
                 self._listener(Hint(text))
         return None
+
+    @property
+    def has_bytes(self) -> bool:
+        """Whether anything has come."""
+        return self._bytes > 0
 
     def _ask_hello(self, host_s: float) -> None:
         self._asked_s = host_s
@@ -391,6 +396,7 @@ class LinkSession:
     def _on_status(self, status: Status, host_s: float) -> None:
         if self.status is not None:
             self._count("rx-error", max(status.errors - self.status.errors, 0))
+            self._note_unsent(max(status.unsent_records - self.status.unsent_records, 0))
         self._check_line(status, was_polled=self.status is not None and self.status.polled)
         self.status = status
         if self._refused or self._computing is not None:  # which may sleep between its fixes
@@ -408,6 +414,15 @@ class LinkSession:
         self.clock.update(status.ticks, host_s)
         if not self.ready:
             self._begin_to_report()
+
+    def _note_unsent(self, records: int) -> None:
+        """Records without room on the line are missing like spoilt ones; report once that it is full."""
+        line = self.line
+        line.unsent, line.spoilt = line.unsent + records, line.spoilt - records
+        if not self._reported_full and line.unsent > NOTABLE_SHARE * (line.sound + line.unsent) + _MIN_SPOILT:
+            self._reported_full = True
+            cure = "fewer beacons (skyless site new --board dwm1001-dev), or a higher rate (skyless flash-config)"
+            self._listener(Hint(f"the line from the board at {self._port} is full, and records are left out: {cure}"))
 
     def _check_line(self, status: Status, *, was_polled: bool) -> None:
         """Count when the board starts to poll its radio, and report it once."""
@@ -432,8 +447,8 @@ class LinkSession:
 def spoilt_line(port: str, share: float) -> str:
     """What to do about a line that spoils this share of the records."""
     return (
-        f"{100 * share:.0f} % of what the board at {port} says is spoilt on the line: try another cable or hub, or a "
-        f"lower rate (skyless flash-config --baud {BAUDS[0]})"
+        f"{100 * share:.0f} % of what the board at {port} says is spoilt on the line: try another cable, no hub, or a "
+        f"rate of {BAUDS[0]} baud or lower (skyless flash-config --baud {BAUDS[0]})"
     )
 
 
@@ -464,14 +479,19 @@ class SerialRadio:
         """``bauds``: rates at which the board is looked for; the flags are those of ``LinkSession``."""
         self.name = name
         self.counters: Counter[str] = Counter()
-        self.lead_s = _LEAD_S + _LEAD_BITS / bauds[0]
-        self._bauds = deque(bauds)
-        self._untried = len(bauds)
+        self._bauds, self._tried = deque(bauds), 0
+        self._reason = ""
+        """Why none of the rates that were tried is the board's; one at which bytes came says most."""
         self._delays = AntennaDelays() if delays is None else delays
         self._transmits, self._phases, self._computing = transmits, phases, computing
         self._port = SerialPort(path, bauds[0], lambda reason: self._listener(Gone(reason)))
         self._listener: Listener = ignore
         self._session: LinkSession | None = None
+
+    @property
+    def lead_s(self) -> float:
+        """Initial lead time of ``transmit``, at the present rate."""
+        return _LEAD_S + _LEAD_BITS / self._port.baud
 
     @property
     def hello(self) -> Hello | None:
@@ -518,6 +538,7 @@ class SerialRadio:
     def _on_event(self, event: RadioEvent) -> None:
         if isinstance(event, Restarted):
             self._port.clear_report()
+            self._tried = 0
         self._listener(event)
 
     async def _poll(self) -> None:
@@ -529,14 +550,16 @@ class SerialRadio:
                     self._port.reopen(reason if self._session.line.sound else self._try_next_rate(reason))
 
     def _try_next_rate(self, reason: str) -> str | None:
-        """Look for a silent board at the next rate. Returns the reason with the rates when all have been tried."""
+        """Look for a silent board at the next rate. Returns why there is none when all have been tried."""
+        if not self._tried or (self._session is not None and self._session.has_bytes):
+            self._reason = reason
         self._bauds.rotate(-1)
         self._port.baud = self._bauds[0]
-        self._untried = self._untried - 1 or len(self._bauds)
-        if self._untried < len(self._bauds):
+        self._tried = (self._tried + 1) % len(self._bauds)
+        if self._tried:
             return None
-        rates = ", ".join(f"{baud}" for baud in self._bauds)
-        return f"{reason} (tried {rates} baud)" if len(self._bauds) > 1 else reason
+        rates = f" (tried {', '.join(map(str, self._bauds))} baud)" if len(self._bauds) > 1 else ""
+        return self._reason + rates
 
     # What the port calls
 

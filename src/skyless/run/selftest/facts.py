@@ -112,9 +112,10 @@ class Report(Struct):
 def judge(report: Report) -> list[Check]:
     """Every check of a report; each that failed has a sentence of its own."""
     checks = [check for board in report.boards for check in _board(board)]
-    if len(report.boards) == 2 and all(board.tx_ticks for board in report.boards):
+    if len(report.boards) == 2:
         a, b = report.boards
-        checks += _pair(a, b, report.distance_m)
+        is_pair = a.tx_ticks and b.tx_ticks
+        checks += _pair(a, b, report.distance_m) if is_pair else [Check("pair", "not checked", "A board did not send.")]
     return checks
 
 
@@ -171,7 +172,9 @@ def _board(board: BoardFacts) -> Iterator[Check]:
 
 def _line(name: str, board: BoardFacts) -> Check:
     """Whether the board's own rate is clean, and which rates are."""
-    spoilt = {one.baud: 0.0 for one in board.lines} | {board.baud: 0.0}
+    spoilt = {one.baud: 0.0 for one in board.lines}
+    if board.baud not in spoilt:
+        return Check(name, "not checked", f"Its own rate of {board.baud:,} baud was not tested.")
     for one in board.lines:
         spoilt[one.baud] = max(spoilt[one.baud], 1.0 - one.came / max(one.sent, 1))
     clean = sorted(baud for baud, share in spoilt.items() if share == 0.0)
@@ -228,6 +231,8 @@ def _clocks(name: str, first: Clocks, last: Clocks) -> Iterator[Check]:
     passed_s = 1e-6 * max(last.us - first.us & 0xFFFF_FFFF, 1)
     slow_ppm = 1e6 * ((last.slow_periods - first.slow_periods & 0xFF_FFFF) / _SLOW_HZ / passed_s - 1.0)
     sentence = "The slow crystal does not run; sleeping tags will be off."
+    if abs(slow_ppm) < 1000.0:  # an RC oscillator is worse
+        sentence = f"The slow crystal is off by {slow_ppm:+.0f} ppm: please report."
     found = f"Against the fast one {slow_ppm:+.0f} ppm over {passed_s:.0f} s."
     yield _check(f"{name}, slow crystal", fails=abs(slow_ppm) > 200.0, sentence=sentence, finding=found)
     chip_ppm = 1e6 * _wrapped(last.ticks - first.ticks - passed_s * TICK_RATE_HZ) / (passed_s * TICK_RATE_HZ)
@@ -256,6 +261,8 @@ def _counts(name: str, board: BoardFacts, lock_us: int, clock: int, carrier: int
 
 
 def _sending(name: str, board: BoardFacts) -> Check:
+    if len(board.tx_ticks) + board.late < board.asked // 2:
+        return Check(name, "not checked", f"Of {board.asked} frames the board confirmed {len(board.tx_ticks)}.")
     if board.late > board.asked // 10:
         advice = "Close other programs and repeat; a slow computer needs longer slots."
         return Check(name, "warning", f"{board.late} of {board.asked} frames came too late to be sent.", advice)
@@ -297,9 +304,9 @@ def direction(sender: BoardFacts, receiver: BoardFacts) -> Direction | None:
     sent_s, late_s = _times(sender, rows)
     left = (sent_s[2:] - sent_s[1:-1]) / np.maximum(sent_s[2:] - sent_s[:-2], TICK_S)
     beside = late_s[1:-1] - left * late_s[:-2] - (1.0 - left) * late_s[2:]
+    parts = sent_s >= 0.0, sent_s <= _ENDS_S, sent_s >= sent_s[-1] - _ENDS_S
     rate, begin, end = (
-        np.polyfit(sent_s[part], late_s[part], 1)[0]
-        for part in (sent_s >= 0.0, sent_s <= _ENDS_S, sent_s >= sent_s[-1] - _ENDS_S)
+        np.polyfit(sent_s[part], late_s[part], 1)[0] if part.sum() >= _MIN_FRAMES else math.nan for part in parts
     )
     return Direction(
         lost=1.0 - len(rows) / len(sender.tx_ticks),

@@ -4,7 +4,7 @@ import asyncio
 import contextlib
 import time
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Coroutine, Sequence
 from typing import Any, Final, TypeVar
 
 from msgspec import Struct
@@ -56,11 +56,15 @@ _BURST: Final = 8
 _ANSWER_S: Final = 0.3
 _TRIES: Final = 10
 _HELLO_TRIES: Final = 4
+_SET_TRIES: Final = 6
+_STAY_S: Final = 1.0
 _TRIAL_S: Final = 3.5
 """After which a board has given up a rate at which it understood nothing."""
-_LEAD_S: Final = 12e-3
+_LEAD_S: Final = 8e-3
+_LEAD_BITS: Final = 2 * LINE_BYTES[1] * 10
+"""A frame's way to the board, and on the line a command and the record by which the board's counter is known."""
 _FRAME_S: Final = 7.5e-3
-"""Between a frame of one board and the next of the other. A board holds one: its next must not come before it left."""
+"""Between a frame of one board and the next of the other, at least."""
 _FRAME: Final = b"\x41\x88skyless selftest"
 """The begin of a test frame: a data frame that no tag takes for a beacon."""
 
@@ -75,6 +79,8 @@ class Bench:
     def __init__(self, name: str, path: str) -> None:
         self.facts = BoardFacts(name, path)
         self.port = SerialPort(path, link.BAUDS[0], self._note_trouble)
+        self.can_send = False
+        """Whether its chip has started."""
         self._trouble = f"There is no {path}."
         self._opened = asyncio.Event()
         self._send: Callable[[bytes], None] = lambda data: None  # noqa: ARG005 - nothing is open
@@ -148,7 +154,8 @@ class Bench:
             with contextlib.suppress(TimeoutError):
                 found: Answer = await asyncio.wait_for(self._answer, wait_s)
                 return found
-        raise TroubleError(f"The board at {self.facts.path} does not answer.")
+        is_open = self._opened.is_set()
+        raise TroubleError(f"The board at {self.facts.path} does not answer." if is_open else self._trouble)
 
     async def _hello_at(self, baud: int) -> link.Hello | None:
         """Open the port at a rate; the board's identity, or None if it does not answer. Raises TroubleError."""
@@ -177,27 +184,35 @@ class Bench:
             raise TroubleError("Its firmware is too old to be tested: skyless flash brings the present one.")
         self._settings = (await self._ask(link.ASK_TAG_CONFIG, b"", link.TagConfig)).settings
         self.facts.baud = self._settings.baud
+        await self._set(self._as_radio(baud))
+
+    def _as_radio(self, baud: int) -> link.BoardSettings:
+        """Its settings, but a radio at this rate: a tag would write text, compute and sleep."""
+        return replace(self._settings, mode=link.MODES.index("radio"), baud=baud)
 
     async def _set(self, settings: link.BoardSettings) -> None:
         """Use settings until the next start; a line that spoils much may lose the answer only."""
         with contextlib.suppress(TroubleError):
-            body = b"\0" + link.pack(settings)
-            await self._ask(link.SET_TAG_CONFIG, body, link.TagConfig, tries=_HELLO_TRIES)
+            await self._ask(link.SET_TAG_CONFIG, b"\0" + link.pack(settings), link.TagConfig, tries=_SET_TRIES)
 
     async def _set_rate(self, baud: int) -> bool:
         """Go to another rate; False, at its own one, if the board is not understood there."""
-        await self._set(replace(self._settings, mode=0, baud=baud))
+        await self._set(self._as_radio(baud))
         if await self._hello_at(baud) is not None:
             return True
         await asyncio.sleep(_TRIAL_S)
         await self._hello_at(self.facts.baud)
+        await self._set(self._as_radio(self.facts.baud))
         return False
 
     async def _read(self, file: int, sub: int = 0, octets: int = 4, times: int = 1, more: bytes = b"\0") -> link.Value:
         """READ; ``more`` are its flags, and what is to be written. Raises TroubleError."""
         numbers = (file, 1), (sub, 2), (octets, 1), (times, 2)
         body = b"".join(number.to_bytes(size, "little") for number, size in numbers)
-        return await self._ask(link.READ, body + more, link.Value, wait_s=1.0)
+        while True:
+            value = await self._ask(link.READ, body + more, link.Value, wait_s=1.0)
+            if (value.file, value.sub) == (file, sub):  # else it is a late answer to another question
+                return value
 
     async def _words(self, file: int, sub: int = 0) -> list[int]:
         """A reading of words of four bytes."""
@@ -211,10 +226,13 @@ class Bench:
         is_there = baud == self.port.baud or await self._set_rate(baud)
         for size in LINE_BYTES:
             came = [0, 0]
-            with contextlib.suppress(TroubleError):
+            try:
                 if is_there:
                     came[0] = await self._test_from_board(baud, records, size)
                     came[1] = await self._test_to_board(baud, records, size)
+            except TroubleError:
+                if not self._opened.is_set():
+                    raise
             ways = zip((True, False), came, strict=True)
             self.facts.lines += [LineTest(baud, way, size, records, min(number, records)) for way, number in ways]
 
@@ -245,8 +263,8 @@ class Bench:
         if best != self.port.baud:
             await self._set_rate(best)
 
-    async def test_chip(self, times: int) -> bool:
-        """Processor, identifier, a pattern and the factory's data; whether the chip has started."""
+    async def test_chip(self, times: int) -> None:
+        """Processor, identifier, a pattern and the factory's data."""
         found = self.facts
         part, variant, revision, pin, lock, stack, used = (await self._words(link.FACTS))[:7]
         found.processor = part, variant, revision, pin, lock, stack, used
@@ -264,7 +282,16 @@ class Bench:
                 found.readings.append(_reading(hz, PATTERN, one, times))
         if has_started:
             found.otp = {name: (await self._words(link.OTP, address))[0] for name, address in OTP_WORDS.items()}
-        return has_started
+        self.can_send = has_started
+
+    async def stay(self) -> None:
+        """Keep the board at its rate, which it would give up in silence."""
+        await self._ask(link.ASK_STATUS, b"", link.Status)
+
+    @property
+    def lead_s(self) -> float:
+        """How early a frame is handed over; a board holds one, so its next must not come before it has left."""
+        return _LEAD_S + _LEAD_BITS / self.port.baud
 
     async def begin_frames(self) -> None:
         """Read all clocks at once, and turn the receiver on."""
@@ -278,24 +305,28 @@ class Bench:
         self.facts.clocks.append(Clocks(us, slow, ticks))
 
     def send_frame(self, number: int) -> None:
-        """Send a numbered frame some milliseconds from now."""
+        """Send a numbered frame after the lead."""
         now_ticks = self._clock.read(time.monotonic())
         if now_ticks is None or not self.facts.can_transmit:
             return
         body = _FRAME + number.to_bytes(4, "little") + bytes(range(FRAME_BYTES - len(_FRAME) - 6))
-        dx_ticks = wrap(now_ticks + from_seconds(_LEAD_S))
+        dx_ticks = wrap(now_ticks + from_seconds(self.lead_s))
         self._pending[dx_ticks] = number
         self.facts.asked += 1
         self._send(self._writer.tx_at(dx_ticks, body + fcs(body)))
 
     async def finish(self) -> None:
-        """What was counted and measured meanwhile; then the board has its own settings again."""
+        """What was counted and measured meanwhile."""
         await self._read_clocks()
         lock_us, clock, carrier, reception_us, tested = (await self._words(link.COUNTS))[:5]
         self.facts.counts = lock_us, clock, carrier, reception_us, tested
         status = await self._ask(link.ASK_STATUS, b"", link.Status)
         self.facts.temperature_c, self.facts.supply_v = status.temperature_c, status.supply_v
-        await self._set(self._settings)
+
+    def restore(self) -> None:
+        """Let the board have its own settings again, without waiting for its answer."""
+        if self.facts.baud:
+            self._send(self._writer.record(link.SET_TAG_CONFIG, b"\0" + link.pack(self._settings)))
 
 
 def _reading(hz: int, expected: bytes, value: link.Value, times: int) -> Reading:
@@ -303,32 +334,42 @@ def _reading(hz: int, expected: bytes, value: link.Value, times: int) -> Reading
     return Reading(hz, expected[::-1].hex().upper(), value.data[::-1].hex().upper(), times, value.differing)
 
 
+def report_of(benches: Sequence[Bench], distance_m: float | None) -> Report:
+    """What was found so far; the distance is that between the antennas of two boards."""
+    return Report(installed_version(), time.strftime("%Y-%m-%d %H:%M"), distance_m, [one.facts for one in benches])
+
+
 async def measure(
     benches: Sequence[Bench],
-    distance_m: float | None = None,
     amounts: Amounts | None = None,
     reach: Callable[[str], None] = lambda step: None,  # noqa: ARG005
-) -> Report:
+) -> None:
     """Test each board alone, then two of them together. ``reach`` is called at the begin of each step."""
     amounts = amounts or Amounts()
-    made = time.strftime("%Y-%m-%d %H:%M")
     running = [asyncio.ensure_future(bench.port.run(bench)) for bench in benches]
+    at_work = set(benches)
     try:
-        work = [_test_alone(bench, amounts, reach) for bench in benches]
-        ready = [bench for bench, can_send in zip(benches, await asyncio.gather(*work), strict=True) if can_send]
-        try:
-            await _send_frames(ready, amounts, reach)
-        except TroubleError as error:
-            ready[0].facts.trouble = str(error)
+        await asyncio.gather(*(_guarded(bench, _test_alone(bench, amounts, reach, at_work)) for bench in benches))
+        await _send_frames([one for one in benches if one.can_send], amounts, reach)
     finally:
+        for bench in benches:
+            bench.restore()
+        await asyncio.sleep(0)  # so that the ports get it
         for task in running:
             task.cancel()
         await asyncio.gather(*running, return_exceptions=True)
-    return Report(installed_version(), made, distance_m, [bench.facts for bench in benches])
 
 
-async def _test_alone(bench: Bench, amounts: Amounts, reach: Callable[[str], None]) -> bool:
-    """Line, processor and chip; whether the chip can be used."""
+async def _guarded(bench: Bench, step: Coroutine[Any, Any, None]) -> None:
+    """Note the trouble of a step, in which the board cannot go on."""
+    try:
+        await step
+    except TroubleError as error:
+        bench.facts.trouble, bench.can_send = str(error), False
+
+
+async def _test_alone(bench: Bench, amounts: Amounts, reach: Callable[[str], None], at_work: set[Bench]) -> None:
+    """Line, processor and chip; then wait for the others that are at work."""
     name = bench.facts.name
     try:
         reach(f"{name}: connecting")
@@ -338,25 +379,26 @@ async def _test_alone(bench: Bench, amounts: Amounts, reach: Callable[[str], Non
             await bench.test_line(baud, amounts.records)
         await bench.use_cleanest_rate()
         reach(f"{name}: processor and chip")
-        return await bench.test_chip(amounts.readings)
-    except TroubleError as error:
-        bench.facts.trouble = str(error)
-        return False
+        await bench.test_chip(amounts.readings)
+    finally:
+        at_work.discard(bench)
+    while at_work:
+        await bench.stay()
+        await asyncio.sleep(_STAY_S)
 
 
 async def _send_frames(benches: Sequence[Bench], amounts: Amounts, reach: Callable[[str], None]) -> None:
-    """Let two boards send in turns from the moment that they receive, or one alone. Raises TroubleError."""
+    """Let two boards send in turns from the moment that they receive, or one alone."""
     if not benches:
         return
     seconds = amounts.pair_s if len(benches) > 1 else amounts.alone_s
-    period_s = _FRAME_S if len(benches) > 1 else seconds / amounts.alone_frames
+    slowest_s = max(_FRAME_S, 0.6 * max(bench.lead_s for bench in benches))
+    period_s = slowest_s if len(benches) > 1 else seconds / amounts.alone_frames
     reach(f"{' and '.join(one.facts.name for one in benches)}: frames for {seconds:.0f} s")
-    for bench in benches:
-        await bench.begin_frames()
+    await asyncio.gather(*(_guarded(bench, bench.begin_frames()) for bench in benches))
     began_s = time.monotonic()
     for number in range(round(seconds / period_s)):
         await asyncio.sleep(max(began_s + number * period_s - time.monotonic(), 0.0))
         benches[number % len(benches)].send_frame(number)
     await asyncio.sleep(_ANSWER_S)
-    for bench in benches:
-        await bench.finish()
+    await asyncio.gather(*(_guarded(bench, bench.finish()) for bench in benches))
