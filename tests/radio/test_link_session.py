@@ -425,3 +425,20 @@ def test_a_line_that_spoils_records_is_named_once_within_ten_seconds(share, word
     named = list(map(int, re.findall(r"(\d+) % of what the board", hints)))
     assert len(named) == (share > 0) or named[0] < 10 <= named[1]
     assert not named or abs(named[-1] - words) <= max(5, 0.3 * words)
+
+
+def test_a_full_line_is_not_called_a_spoilt_one():
+    """The board counts a record's number before it finds that there is no room, and says so in its status."""
+    talk, unsent = Talk().ready(), 0
+    for number in range(1500):
+        line = talk.board.rx(number, -8000, -8100, 0, bytes(100))
+        if number % 20:
+            talk.hear(line)
+        else:
+            unsent += 1
+        if number % 75 == 74:
+            talk.poll(STATUS_S)
+            talk.hear(talk.board.status(T0, ON, [*COUNTS[:5], COUNTS[5] + unsent]))
+    hints = [one.text for one in talk.events if isinstance(one, Hint)]
+    assert len(hints) == 1
+    assert "is full" in hints[0]

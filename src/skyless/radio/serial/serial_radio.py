@@ -71,6 +71,8 @@ _LINE_S: Final = 10.0
 _LINE_POLLS: Final = 6
 _MIN_SPOILT: Final = 3
 """The line is judged by the records of this time at most; after this number of polls, and spoilt records, at least."""
+_SETTLED_S: Final = 4.0
+"""A status that is older says nothing of the records that are missing now."""
 SPOILT_SHARE: Final = 0.1
 """From this share of spoilt records on a line is as good as none; from ``NOTABLE_SHARE`` on it is reported."""
 
@@ -106,19 +108,29 @@ class LineQuality:
 
     def __init__(self) -> None:
         self.sound = self.spoilt = self.unsent = 0
-        """Records since the session's begin; unsent ones are those that the board's line had no room for."""
+        """Records since the session's begin, by the gaps in their numbers; unsent ones had no room on the line."""
+        self._settled = (0, 0)
         self._before: deque[tuple[int, int]] = deque([(0, 0)], maxlen=round(_LINE_S / STATUS_S))
         self._reported = 0.0
 
-    def worse_share(self) -> float | None:
-        """The share of the last seconds, if it should be reported: it is bad, and so bad for the first time."""
-        sound, spoilt = self.sound - self._before[0][0], self.spoilt - self._before[0][1]
-        self._before.append((self.sound, self.spoilt))
-        share = max(spoilt, 0) / max(sound + spoilt, 1)
-        level = max((limit for limit in (NOTABLE_SHARE, SPOILT_SHARE) if share >= limit), default=0.0)
-        if len(self._before) < _LINE_POLLS or spoilt < _MIN_SPOILT or level <= self._reported:
+    def settle(self, unsent: int) -> None:
+        """The board has said how many of the missing records it has not sent since it last did."""
+        self.unsent, self.spoilt = self.unsent + unsent, self.spoilt - unsent
+        self._settled = self.sound, self.spoilt
+
+    def worse_share(self, *, is_settled: bool) -> float | None:
+        """The share of the last seconds, if it should be reported: for the first time, or because it is much worse now.
+
+        ``is_settled``: count until the board's last status only, as later records may be missing for lack of room.
+        """
+        now = self._settled if is_settled else (self.sound, self.spoilt)
+        sound, spoilt = now[0] - self._before[0][0], max(now[1] - self._before[0][1], 0)
+        self._before.append(now)
+        share = spoilt / max(sound + spoilt, 1)
+        least = max(SPOILT_SHARE, 2.0 * self._reported) if self._reported else NOTABLE_SHARE
+        if len(self._before) < _LINE_POLLS or spoilt < _MIN_SPOILT or share < least:
             return None
-        self._reported = level
+        self._reported = share
         return share
 
     @property
@@ -164,7 +176,7 @@ class LinkSession:
         """dx and RMARKER of frames whose end the board has not reported."""
         self._bytes = 0
         self._refused = self._reported = ""
-        self._heard_s = self._asked_s = 0.0
+        self._heard_s = self._asked_s = self._status_s = 0.0
         self._starts: deque[float] = deque(maxlen=_MAX_STARTS)
         self._reported_starts = self._reported_idle = self._reported_line = self._reported_full = False
         self._idle_polls = 0
@@ -182,7 +194,7 @@ class LinkSession:
         """
         if host_s - self._heard_s > (BOARD_SILENCE_S if self.line.sound else unheard_s):
             return self._reason_of_silence()
-        share = self.line.worse_share()
+        share = self.line.worse_share(is_settled=host_s - self._status_s < _SETTLED_S)
         if share is not None:
             self._listener(Hint(spoilt_line(self._port, share)))
         if self.hello is None or self._refused:
@@ -394,6 +406,7 @@ class LinkSession:
         self._listener(Restarted())
 
     def _on_status(self, status: Status, host_s: float) -> None:
+        self._status_s = host_s
         if self.status is not None:
             self._count("rx-error", max(status.errors - self.status.errors, 0))
             self._note_unsent(max(status.unsent_records - self.status.unsent_records, 0))
@@ -418,7 +431,7 @@ class LinkSession:
     def _note_unsent(self, records: int) -> None:
         """Records without room on the line are missing like spoilt ones; report once that it is full."""
         line = self.line
-        line.unsent, line.spoilt = line.unsent + records, line.spoilt - records
+        line.settle(records)
         if not self._reported_full and line.unsent > NOTABLE_SHARE * (line.sound + line.unsent) + _MIN_SPOILT:
             self._reported_full = True
             cure = "fewer beacons (skyless site new --board dwm1001-dev), or a higher rate (skyless flash-config)"
