@@ -58,6 +58,8 @@ _TRIES: Final = 10
 _HELLO_TRIES: Final = 4
 _SET_TRIES: Final = 6
 _STAY_S: Final = 1.0
+_DRAIN_S: Final = 0.05
+"""In which the last record leaves a port."""
 _TRIAL_S: Final = 3.5
 """After which a board has given up a rate at which it understood nothing."""
 _LEAD_S: Final = 8e-3
@@ -66,7 +68,7 @@ _LEAD_BITS: Final = 2 * LINE_BYTES[1] * 10
 _FRAME_S: Final = 7.5e-3
 """Between a frame of one board and the next of the other, at least."""
 _FRAME: Final = b"\x41\x88skyless selftest"
-"""The begin of a test frame: a data frame that no tag takes for a beacon."""
+"""The first bytes of a test frame: a data frame, which no tag takes for a beacon."""
 
 
 class TroubleError(Exception):
@@ -354,7 +356,7 @@ async def measure(
     finally:
         for bench in benches:
             bench.restore()
-        await asyncio.sleep(0)  # so that the ports get it
+        await asyncio.sleep(_DRAIN_S)
         for task in running:
             task.cancel()
         await asyncio.gather(*running, return_exceptions=True)
