@@ -119,14 +119,14 @@ class Pair(EmulatedSite):
             for n in range(2)
         )  # fmt: skip
         noise = replace(lab.noise, tx_stamp_ps=self.fault.stamp_ps, rx_stamp_ps=self.fault.stamp_ps)
-        self.faults, self.image = iter((self.fault, other or Fault())), image
+        faults = self.fault, other or Fault()
+        self.faults, self.image, self.boards = iter(faults), image, boards
         site, wire = replace(lab, anchors=anchors, noise=noise), WireSettings(piece_bytes=128)
         super().__init__(site, [], self.make, seed=seed, wire=wire)
-        self.boards = boards
         if self.fault.crystals_ppm is not None:
             for clock, sign in zip(self.medium.clocks, (1.0, -1.0), strict=True):
                 clock.rate = sign * 1e-6 * self.fault.crystals_ppm
-        for node, fault in zip(self.nodes, (self.fault, Fault()), strict=True):
+        for node, fault in zip(self.nodes, faults, strict=True):
             node.chip.absent = fault.chip == "absent"
             if fault.chip == "no lock":
                 node.chip.clocking.restart = lambda clocking=node.chip.clocking: setattr(clocking, "_lock_s", math.inf)

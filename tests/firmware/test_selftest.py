@@ -1,4 +1,4 @@
-"""The self-test of boards: each fault that is planted is named by its sentence and no other, and sound boards pass."""
+"""The self-test: each planted fault is named by its sentence and no other, and boards without one pass."""
 
 import re
 
@@ -76,7 +76,7 @@ def test_each_fault_is_named_by_its_sentence_and_no_other(fault, boards, sentenc
 
 
 @pytest.mark.parametrize("seed", [1, *(pytest.param(seed, marks=pytest.mark.statistical) for seed in range(2, 51))])
-def test_sound_boards_pass(seed):
+def test_boards_without_a_fault_pass(seed):
     pair = Pair(seed=seed)
     report = pair.test()
     assert sentences(report) == []

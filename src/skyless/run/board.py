@@ -265,7 +265,7 @@ class LinkProtocol(BoardProtocol):
             asyncio.get_running_loop().call_later(pause_s, self._send_tests, count - 1, line_bytes)
 
     def _read(self, record: bytes) -> None:
-        """Answer READ as a sound board would: there is no chip here."""
+        """Answer READ as a board without a fault would: there is no chip here."""
         file, sub, octets = record[2], int.from_bytes(record[3:5], "little"), record[5]
         now_s, ticks = self._clock_s(), self._radio.now_ticks() or 0
         us, periods = round(1e6 * now_s) & 0xFFFF_FFFF, round(32_768 * now_s) & 0xFF_FFFF

@@ -186,10 +186,11 @@ class BoardProbe:
         abilities = "can send" if hello.can_transmit else "only listens"
         finding = f"Firmware {version}, version {hello.major}.{hello.minor} of the serial link; it {abilities}."
         spoilt = self._spoilt_share
-        result: Result = "failed" if spoilt >= SPOILT_SHARE else "warning" if troubles else "ok"
-        board = Check(name, result, finding, troubles or spoilt_line(self.radio.name, spoilt) if result != "ok" else "")
-        if spoilt >= NOTABLE_SHARE:  # what few frames seem to say of the site would be wrong
-            return board, Check(f"{name}, reception", "not checked", "The line spoils too much.", "Mend it first.")
+        is_spoilt = spoilt >= NOTABLE_SHARE
+        result: Result = "failed" if spoilt >= SPOILT_SHARE else "warning" if troubles or is_spoilt else "ok"
+        board = Check(name, result, finding, troubles or (spoilt_line(self.radio.name, spoilt) if is_spoilt else ""))
+        if is_spoilt:  # what the remaining frames seem to say of the site would be wrong
+            return board, Check(f"{name}, reception", "not checked", "The line spoils too much.", "Fix the line first.")
         return board, self._reception(f"{name}, reception"), counters_check(self._pairs, noise, f"{name}, clock")
 
     def _reception(self, name: str) -> Check:

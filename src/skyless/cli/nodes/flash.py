@@ -115,7 +115,7 @@ def firmware(image: Path) -> bytes:
 
 
 def _probe(asked: FlashOptions) -> tuple[str, str]:
-    """Kind of the probe, and its serial number if it has to be told from others. Raises SkylessError."""
+    """Kind of the probe, and its serial number if several are plugged in. Raises SkylessError."""
     found = []
     for folder in sorted(file.parent for file in _USB.glob("*/idVendor") if asked.probe != "pi"):
         files = [folder / name for name in ("idVendor", "product", "serial")]

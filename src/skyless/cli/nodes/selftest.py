@@ -52,22 +52,14 @@ def selftest(*, asked: SelftestOptions, output: JsonOptions) -> int:
 
     Each fault has one sentence; the exit code is 1 if there is one. The report file is what to attach to an issue.
     """
-    if asked.read is not None:
-        asked.leave_out("radio", "report", "separation", why="--read judges a report again")
-        report = _load(asked.read)
-    else:
-        report = _test(asked)
-    checks = judge(report)
-    failed = sum(one.result == "failed" for one in checks)
-    if output.json:
-        print_json({"checks": checks, "failed": failed, "report": asked.report})
-    else:
-        print(report_text(f"skyless selftest {report.skyless_version}, {report.made}", EMULATED, checks), end="")
-    return 1 if failed else 0
+    if asked.read is None:
+        return _test(asked, output)
+    asked.leave_out("radio", "report", "separation", why="--read judges a report again")
+    return _show(_load(asked.read), None, output)
 
 
-def _test(asked: SelftestOptions) -> Report:
-    """Test the boards, and write the report. Raises SkylessError."""
+def _test(asked: SelftestOptions, output: JsonOptions) -> int:
+    """Test the boards; an interrupted test shows and writes what it has found, too. Raises SkylessError."""
     if asked.radio is None:
         raise SkylessError("--radio is missing; it should name the board, as serial:/dev/ttyACM0; or --read a report")
     kind, _, ports = asked.radio.partition(":")
@@ -94,11 +86,22 @@ def _test(asked: SelftestOptions) -> Report:
     finally:
         for bench in benches if not is_whole else ():
             bench.facts.trouble = bench.facts.trouble or "The test was interrupted."
-        report = report_of(benches, asked.separation)
-        if asked.report is not None and benches:
-            write_file(asked.report, to_json(report).encode())
-            say_written(asked.report)
-    return report
+        code = _show(report_of(benches, asked.separation), asked.report, output)
+    return code
+
+
+def _show(report: Report, file: Path | None, output: JsonOptions) -> int:
+    """Print what a report means before it is written, as the disk may be full. Returns the exit code."""
+    checks = judge(report)
+    failed = sum(one.result == "failed" for one in checks)
+    if output.json:
+        print_json({"checks": checks, "failed": failed, "report": file})
+    else:
+        print(report_text(f"skyless selftest {report.skyless_version}, {report.made}", EMULATED, checks), end="")
+    if file is not None:
+        write_file(file, to_json(report).encode())
+        say_written(file)
+    return 1 if failed else 0
 
 
 def _load(path: Path) -> Report:

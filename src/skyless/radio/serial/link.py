@@ -122,7 +122,7 @@ COUNTS: Final = 0x82
 programmable memory, facts of the processor, three clocks at once, and counts since the start."""
 READ_BYTES: Final = 16
 READ_TIMES: Final = 1000
-"""The most of a register that READ reads, and the most often."""
+"""Limits of READ: bytes of a register, and how many times it is read."""
 READ_DATA_AT: Final = 9
 READ_SLOWLY: Final = 0x01
 """Flag in READ: at the slow SPI clock."""
@@ -415,7 +415,7 @@ class NotDone(Struct, frozen=True):
     command: int
     reason: int
     start_step: int | None = None
-    """How far the chip's start came (``dw1000.h``); None where it started, or for a board of version 1.3."""
+    """Where the chip's start ended (``dw1000.h``); None if it started, or for a board of version 1.3."""
     identifier: int = 0
     """Of the chip, as it was read last."""
 

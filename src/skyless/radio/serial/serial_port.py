@@ -84,7 +84,7 @@ class SerialPort:
         return 0 if self._connection is None else self._connection.waiting_bytes()
 
     def reopen(self, reason: str | None) -> None:
-        """Close the port, if open, and open it again; None: nobody needs to know why."""
+        """Close the port, if open, and open it again; None: there is nothing to report."""
         if self._connection is not None:
             self._connection.end(reason)
 
@@ -100,7 +100,7 @@ class SerialPort:
 
 
 class _Connection(asyncio.Protocol):
-    """The port from opening to closing; ``ended`` gives the reason, empty if unknown, None if it is of no interest."""
+    """The port from opening to closing; ``ended`` gives the reason: empty if unknown, None if not to be reported."""
 
     def __init__(self, user: PortUser) -> None:
         self._user = user

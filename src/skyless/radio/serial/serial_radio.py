@@ -107,8 +107,8 @@ class LineQuality:
     """Shares of spoilt records on the line from a board."""
 
     def __init__(self) -> None:
-        self.sound = self.spoilt = self.unsent = 0
-        """Records since the session's begin, by the gaps in their numbers; unsent ones had no room on the line."""
+        self.intact = self.spoilt = self.unsent = 0
+        """Records since the session began, by the gaps in their numbers; unsent ones had no room on the line."""
         self._settled = (0, 0)
         self._before: deque[tuple[int, int]] = deque([(0, 0)], maxlen=round(_LINE_S / STATUS_S))
         self._reported = 0.0
@@ -116,17 +116,17 @@ class LineQuality:
     def settle(self, unsent: int) -> None:
         """The board has said how many of the missing records it has not sent since it last did."""
         self.unsent, self.spoilt = self.unsent + unsent, self.spoilt - unsent
-        self._settled = self.sound, self.spoilt
+        self._settled = self.intact, self.spoilt
 
     def worse_share(self, *, is_settled: bool) -> float | None:
         """The share of the last seconds, if it should be reported: for the first time, or because it is much worse now.
 
         ``is_settled``: count until the board's last status only, as later records may be missing for lack of room.
         """
-        now = self._settled if is_settled else (self.sound, self.spoilt)
-        sound, spoilt = now[0] - self._before[0][0], max(now[1] - self._before[0][1], 0)
+        now = self._settled if is_settled else (self.intact, self.spoilt)
+        intact, spoilt = now[0] - self._before[0][0], max(now[1] - self._before[0][1], 0)
         self._before.append(now)
-        share = spoilt / max(sound + spoilt, 1)
+        share = spoilt / max(intact + spoilt, 1)
         least = max(SPOILT_SHARE, 2.0 * self._reported) if self._reported else NOTABLE_SHARE
         if len(self._before) < _LINE_POLLS or spoilt < _MIN_SPOILT or share < least:
             return None
@@ -135,8 +135,8 @@ class LineQuality:
 
     @property
     def share(self) -> float:
-        """The share since the session's begin."""
-        return max(self.spoilt, 0) / max(self.sound + self.spoilt, 1)
+        """The share since the session began."""
+        return max(self.spoilt, 0) / max(self.intact + self.spoilt, 1)
 
 
 class LinkSession:
@@ -174,7 +174,7 @@ class LinkSession:
         """Number of the next record."""
         self._pending: dict[int, int] = {}
         """dx and RMARKER of frames whose end the board has not reported."""
-        self._bytes = 0
+        self.heard_bytes = 0
         self._refused = self._reported = ""
         self._heard_s = self._asked_s = self._status_s = 0.0
         self._starts: deque[float] = deque(maxlen=_MAX_STARTS)
@@ -192,7 +192,7 @@ class LinkSession:
 
         ``unheard_s``: how long to wait for a board that was never heard.
         """
-        if host_s - self._heard_s > (BOARD_SILENCE_S if self.line.sound else unheard_s):
+        if host_s - self._heard_s > (BOARD_SILENCE_S if self.line.intact else unheard_s):
             return self._reason_of_silence()
         share = self.line.worse_share(is_settled=host_s - self._status_s < _SETTLED_S)
         if share is not None:
@@ -210,11 +210,6 @@ class LinkSession:
                 self._listener(Hint(text))
         return None
 
-    @property
-    def has_bytes(self) -> bool:
-        """Whether anything has come."""
-        return self._bytes > 0
-
     def _ask_hello(self, host_s: float) -> None:
         self._asked_s = host_s
         self._send(self._writer.ask_hello())
@@ -222,10 +217,11 @@ class LinkSession:
     def _reason_of_silence(self) -> str:
         if self.hello is not None:
             return f"the board at {self._port} has stopped answering"
-        if self.line.sound:
+        if self.line.intact:
             return f"the board at {self._port} sends records, but does not answer: does it get what is sent to it?"
-        if self._bytes:
-            return f"what comes from {self._port} is no serial link of Skyless ({self._bytes} bytes); wrong baud rate?"
+        if self.heard_bytes:
+            what = f"what comes from {self._port} is no serial link of Skyless"
+            return f"{what} ({self.heard_bytes} bytes); wrong baud rate?"
         return f"no board answers at {self._port}"
 
     def transmit(self, transmission: Transmission) -> None:
@@ -241,11 +237,11 @@ class LinkSession:
 
     def on_data(self, data: bytes, host_s: float) -> None:
         """Process bytes from the port."""
-        self._bytes += len(data)
+        self.heard_bytes += len(data)
         reader, line = self._reader, self.line
         before, spoilt = reader.garbled + reader.overlong, line.spoilt
         for record in reader.read(data):
-            line.sound += 1
+            line.intact += 1
             self._on_record(record, host_s)
         garbled = reader.garbled + reader.overlong - before
         self._count("garbled-record", garbled)
@@ -432,10 +428,10 @@ class LinkSession:
         """Records without room on the line are missing like spoilt ones; report once that it is full."""
         line = self.line
         line.settle(records)
-        if not self._reported_full and line.unsent > NOTABLE_SHARE * (line.sound + line.unsent) + _MIN_SPOILT:
+        if not self._reported_full and line.unsent > NOTABLE_SHARE * (line.intact + line.unsent) + _MIN_SPOILT:
             self._reported_full = True
-            cure = "fewer beacons (skyless site new --board dwm1001-dev), or a higher rate (skyless flash-config)"
-            self._listener(Hint(f"the line from the board at {self._port} is full, and records are left out: {cure}"))
+            advice = "fewer beacons (skyless site new --board dwm1001-dev), or a higher rate (skyless flash-config)"
+            self._listener(Hint(f"the line from the board at {self._port} is full, and records are left out: {advice}"))
 
     def _check_line(self, status: Status, *, was_polled: bool) -> None:
         """Count when the board starts to poll its radio, and report it once."""
@@ -560,11 +556,11 @@ class SerialRadio:
             if self._session is not None:
                 reason = self._session.poll(time.monotonic(), BOARD_SILENCE_S / len(self._bauds))
                 if reason is not None:
-                    self._port.reopen(reason if self._session.line.sound else self._try_next_rate(reason))
+                    self._port.reopen(reason if self._session.line.intact else self._try_next_rate(reason))
 
     def _try_next_rate(self, reason: str) -> str | None:
         """Look for a silent board at the next rate. Returns why there is none when all have been tried."""
-        if not self._tried or (self._session is not None and self._session.has_bytes):
+        if not self._tried or (self._session is not None and self._session.heard_bytes):
             self._reason = reason
         self._bauds.rotate(-1)
         self._port.baud = self._bauds[0]

@@ -119,7 +119,7 @@ def judge(report: Report) -> list[Check]:
     return checks
 
 
-REPORT: Final = "Please report this."
+_REPORT: Final = "Please report this."
 _SUPPLY: Final = "Measure the supply at the module; another USB port or cable."
 _PLACE: Final = "Put them 1 to 2 m apart, nothing between or beside."
 _NRF52832: Final = 0x52832
@@ -127,7 +127,7 @@ _REVISIONS: Final = {5: 1, 6: 2, 7: 3}
 """By what an nRF52832 states."""
 _RESET_PIN: Final = 21
 _OPEN_PORT: Final = {1: 0xFF, 2: 0xFF, 3: 0x5A}
-"""In UICR, by the revision: the reset pin, and the value that leaves the debug port open."""
+"""In UICR: the pin of the reset button, and by the revision the value that leaves the debug port open."""
 _BAD_CAUSES: Final = link.RESET_BY_WATCHDOG | link.RESET_BY_LOCKUP | link.RESET_BY_FAULT
 _NO_LOCK: Final = 2
 """Of ``start_step``."""
@@ -136,7 +136,7 @@ _RECEPTION_US: Final = 275.0
 """By docs/hardware.md, good to a quarter."""
 
 
-def _check(name: str, *, fails: bool, sentence: str, finding: str, advice: str = REPORT) -> Check:
+def _check(name: str, *, fails: bool, sentence: str, finding: str, advice: str = _REPORT) -> Check:
     return Check(name, "failed", sentence, advice) if fails else Check(name, "ok", finding)
 
 
@@ -145,7 +145,7 @@ def _board(board: BoardFacts) -> Iterator[Check]:
     found = f"{board.path}, firmware {version}, device {board.device_id}."
     line = [_line(f"{name}, line", board)] if board.lines else []
     if board.trouble and line and line[0].result == "failed":  # which explains it
-        yield Check(name, "not checked", board.trouble, "Mend the line first.")
+        yield Check(name, "not checked", board.trouble, "Fix the line first.")
     else:
         yield _check(name, fails=bool(board.trouble), sentence=board.trouble, finding=found, advice="")
     yield from line
@@ -192,7 +192,7 @@ def _line(name: str, board: BoardFacts) -> Check:
 def _processor(name: str, facts: tuple[int, int, int, int, int, int, int], cause: int) -> Check:
     part, _, word, reset_pin, debug, stack, used = facts
     revision, share = word >> 4 & 0xF, used / max(stack, 1)
-    sentence, advice = "", REPORT
+    sentence, advice = "", _REPORT
     if part != _NRF52832:
         sentence = f"This processor is a {part:X}, not an nRF52832."
     elif revision not in _REVISIONS:
@@ -210,7 +210,7 @@ def _processor(name: str, facts: tuple[int, int, int, int, int, int, int], cause
 def _chip(name: str, board: BoardFacts) -> Check:
     """Identifier and a pattern, at both clocks of the SPI, and the start."""
     worst = max(board.readings, key=lambda one: (one.differing, one.found != one.expected))
-    sentence, advice = "", REPORT
+    sentence, advice = "", _REPORT
     if worst.differing:
         number, rate = f"{worst.differing:,} of {worst.times:,}", f"{worst.hz / 1e6:g} MHz"
         sentence = f"{number} readings of {worst.expected} at {rate} differ: the SPI is disturbed."
@@ -247,11 +247,11 @@ def _counts(name: str, board: BoardFacts, lock_us: int, clock: int, carrier: int
     fails = bool(clock or carrier)
     yield _check(f"{name}, PLL", fails=fails, sentence=sentence, finding=found, advice=_SUPPLY)
     if board.temperature_c is not None and board.supply_v is not None:
-        is_cold_or_hot, is_off = not 5.0 <= board.temperature_c <= 60.0, not 3.0 <= board.supply_v <= 3.5
-        sentence = f"The supply is {board.supply_v:.2f} V, not 3.3." if is_off else ""
-        sentence = sentence or f"The chip is at {board.temperature_c:.0f} °C."
+        is_off = not 3.0 <= board.supply_v <= 3.5
+        sentence = f"The chip is at {board.temperature_c:.0f} °C."
+        sentence = f"The supply is {board.supply_v:.2f} V, not 3.3." if is_off else sentence
         found = f"{board.temperature_c:.0f} °C, {board.supply_v:.2f} V."
-        fails = is_cold_or_hot or is_off
+        fails = is_off or not 5.0 <= board.temperature_c <= 60.0
         yield _check(f"{name}, temperature, supply", fails=fails, sentence=sentence, finding=found, advice=_SUPPLY)
     if board.heard:
         error = abs(reception_us / _RECEPTION_US - 1.0)
@@ -345,10 +345,9 @@ def two_way_ticks(first: BoardFacts, second: BoardFacts) -> float:
     """
     rows = [one for one in second.heard if one.number in first.tx_ticks]
     sent_s, late_s = _times(first, rows)
-    began_tx, began_rx, found = first.tx_ticks[rows[0].number], rows[0].rx_ticks, []
+    began_tx, began_rx, turn, found = first.tx_ticks[rows[0].number], rows[0].rx_ticks, WRAP_TICKS * TICK_S, []
     for one in first.heard:
         passed = one.rx_ticks - began_tx
-        turn = WRAP_TICKS * TICK_S
         about_s = float(np.interp(one.number, [row.number for row in (rows[0], rows[-1])], [0.0, sent_s[-1]]))
         at_s = passed * TICK_S + turn * round((about_s - passed * TICK_S) / turn)
         if one.number in second.tx_ticks and sent_s[0] < at_s < sent_s[-1]:
@@ -359,17 +358,18 @@ def two_way_ticks(first: BoardFacts, second: BoardFacts) -> float:
 
 def _pair(a: BoardFacts, b: BoardFacts, distance_m: float | None) -> Iterator[Check]:
     there, back = direction(a, b), direction(b, a)
-    for sender, hearer, one in ((a.name, b.name, there), (b.name, a.name, back)):
+    for sender, receiver, one in ((a.name, b.name, there), (b.name, a.name, back)):
         lost = 1.0 if one is None else one.lost
-        sentence = f"{hearer} loses {100 * lost:.0f} % of {sender}'s frames."
-        sentence = f"{hearer} does not hear {sender}." if one is None else sentence
+        sentence = f"{receiver} loses {100 * lost:.0f} % of {sender}'s frames."
+        sentence = f"{receiver} does not hear {sender}." if one is None else sentence
         found = "" if one is None else f"{100 * lost:.1f} % lost, {one.power_dbm:.0f} dBm."
-        yield _check(f"{sender} to {hearer}", fails=lost > 0.05, sentence=sentence, finding=found, advice=_PLACE)
+        yield _check(f"{sender} to {receiver}", fails=lost > 0.05, sentence=sentence, finding=found, advice=_PLACE)
     if there is None or back is None:
         return
     less_db = back.power_dbm - there.power_dbm
-    sender, hearer = (a.name, b.name) if less_db > 0.0 else (b.name, a.name)
-    sentence = f"{hearer} hears {sender} {abs(less_db):.0f} dB weaker than {sender} hears {hearer}: antenna covered?"
+    sender, receiver = (a.name, b.name) if less_db > 0.0 else (b.name, a.name)
+    weaker = f"{receiver} hears {sender} {abs(less_db):.0f} dB weaker"
+    sentence = f"{weaker} than {sender} hears {receiver}: antenna covered?"
     found = f"Both ways equal within {abs(less_db):.1f} dB."
     yield _check("pair, power", fails=abs(less_db) > 4.0, sentence=sentence, finding=found, advice=_PLACE)
     differ, stated = abs(there.counter_ppm), f"{there.carrier_ppm:+.1f} and {back.carrier_ppm:+.1f} ppm"

@@ -57,7 +57,7 @@ _ANSWER_S: Final = 0.3
 _TRIES: Final = 10
 _HELLO_TRIES: Final = 4
 _SET_TRIES: Final = 6
-_STAY_S: Final = 1.0
+_KEEP_ALIVE_S: Final = 1.0
 _DRAIN_S: Final = 0.05
 """In which the last record leaves a port."""
 _TRIAL_S: Final = 3.5
@@ -286,8 +286,8 @@ class Bench:
             found.otp = {name: (await self._words(link.OTP, address))[0] for name, address in OTP_WORDS.items()}
         self.can_send = has_started
 
-    async def stay(self) -> None:
-        """Keep the board at its rate, which it would give up in silence."""
+    async def keep_alive(self) -> None:
+        """Let the board understand a record, or it would give up a rate that its flash does not hold."""
         await self._ask(link.ASK_STATUS, b"", link.Status)
 
     @property
@@ -346,12 +346,12 @@ async def measure(
     amounts: Amounts | None = None,
     reach: Callable[[str], None] = lambda step: None,  # noqa: ARG005
 ) -> None:
-    """Test each board alone, then two of them together. ``reach`` is called at the begin of each step."""
+    """Test each board alone, then two of them together. ``reach`` is called at the start of each step."""
     amounts = amounts or Amounts()
     running = [asyncio.ensure_future(bench.port.run(bench)) for bench in benches]
-    at_work = set(benches)
+    unfinished = set(benches)
     try:
-        await asyncio.gather(*(_guarded(bench, _test_alone(bench, amounts, reach, at_work)) for bench in benches))
+        await asyncio.gather(*(_guarded(bench, _test_alone(bench, amounts, reach, unfinished)) for bench in benches))
         await _send_frames([one for one in benches if one.can_send], amounts, reach)
     finally:
         for bench in benches:
@@ -370,8 +370,8 @@ async def _guarded(bench: Bench, step: Coroutine[Any, Any, None]) -> None:
         bench.facts.trouble, bench.can_send = str(error), False
 
 
-async def _test_alone(bench: Bench, amounts: Amounts, reach: Callable[[str], None], at_work: set[Bench]) -> None:
-    """Line, processor and chip; then wait for the others that are at work."""
+async def _test_alone(bench: Bench, amounts: Amounts, reach: Callable[[str], None], unfinished: set[Bench]) -> None:
+    """Line, processor and chip; then wait for the boards that are unfinished."""
     name = bench.facts.name
     try:
         reach(f"{name}: connecting")
@@ -383,10 +383,10 @@ async def _test_alone(bench: Bench, amounts: Amounts, reach: Callable[[str], Non
         reach(f"{name}: processor and chip")
         await bench.test_chip(amounts.readings)
     finally:
-        at_work.discard(bench)
-    while at_work:
-        await bench.stay()
-        await asyncio.sleep(_STAY_S)
+        unfinished.discard(bench)
+    while unfinished:
+        await bench.keep_alive()
+        await asyncio.sleep(_KEEP_ALIVE_S)
 
 
 async def _send_frames(benches: Sequence[Bench], amounts: Amounts, reach: Callable[[str], None]) -> None:
