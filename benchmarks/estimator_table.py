@@ -48,7 +48,7 @@ MECHANISMS: dict[str, dict[str, float]] = {
     "… widen all range errors": {"jump_rise": 0.0},
     "… may still be changing": {"first_change_scale": 1.0},
     "… of more than 20 cm return slowly": {"obstruction_return_m": OFF},
-    "… end where the error is small": {"ended_std_m": 0.0},
+    "… end where receptions are likelier without": {"ended_log_odds": OFF},
     "Single late packets": {"late_often_share": OFF},
     "… need more in a row for a jump": {"in_row_where_late": 2},
     "… less weight of large innovations": {"reception_huber": OFF},

@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+from scipy.stats import norm
 
 from skyless.core.estimator import monitor
 from skyless.core.estimator.settings import TUNING, EstimatorSettings
@@ -91,26 +92,25 @@ def test_a_range_error_that_has_jumped_is_estimated_again():
     assert s.status.range_errors == CHANGING_RANGE_ERRORS
 
 
-def test_an_obstruction_ends_once_the_range_error_is_known_and_close_to_zero():
-    ended = []
-    for variance, error_m in ((0.01, 0.0), (0.0024, 0.0), (0.0024, 0.1), (0.0024, 0.099), (0.0024, -0.11)):
-        s = state()
-        change = s.layout.change + 1
-        s.x[change], s.P[at(change, change)], s.status.place_variance_m2 = error_m, variance, 0.0001
-        monitor.end_small_obstruction(s, 1)
-        assert s.status.ends_of_obstructions == 0, "there was none"
-        s.anchors[1].is_obstructed = True
-        monitor.end_small_obstruction(s, 1)
-        assert s.status.ends_of_obstructions == (not s.anchors[1].is_obstructed)
-        ended.append(not s.anchors[1].is_obstructed)
-    assert ended == [False, True, False, True, False]
+def test_an_obstruction_ends_where_receptions_are_more_likely_without_its_error():
     s = state()
-    change, usual = s.layout.change + 1, 0.0001
-    s.status.place_variance_m2 = usual
-    for variance, over in ((TUNING.ended_std_m**2 + usual + HAIR, False), (TUNING.ended_std_m**2 + usual - HAIR, True)):
-        s.anchors[1].is_obstructed, s.P[at(change, change)] = True, variance
-        monitor.end_small_obstruction(s, 1)
-        assert s.anchors[1].is_obstructed is not over
+    a, change, draw = s.anchors[1], s.layout.change + 1, np.random.default_rng(3)
+    root = draw.normal(0.0, 0.02, (2, 2))
+    P, h, noise_m2 = root @ root.T + 1e-4 * np.eye(2), np.array([0.8, 1.0]), 0.002  # of the range, and its error
+    usual = TUNING.obstructed_std_m**2 * 0.5 + a.change_variance_m2
+    for sign in (1.0, -1.0):
+        h[1], s.status.obstruction, a.is_obstructed, a.ended_log_odds, summed = sign, 0.5, True, 0.0, 0.0
+        for innovation, error_m in ((0.1, 0.2), (-0.15, 0.2), (0.05, 0.0), (-0.2, 0.3), (-0.25, 0.25)):
+            s.x[change], s.P[at(change, change)], s.U[0][change] = sign * error_m, P[1, 1], P[1] @ h
+            with_it = h @ P @ h + noise_m2
+            without = h[0] ** 2 * P[0, 0] + usual + noise_m2
+            ratio = norm.logpdf(innovation + error_m, 0.0, without**0.5) - norm.logpdf(innovation, 0.0, with_it**0.5)
+            summed = max(summed + ratio, 0.0)
+            assert monitor.has_ended(s, 1, sign, innovation, with_it) == (summed > TUNING.ended_log_odds)
+            assert a.ended_log_odds == pytest.approx(summed)
+        assert summed > TUNING.ended_log_odds
+        a.is_obstructed = False
+        assert not monitor.has_ended(s, 1, sign, innovation, with_it), "there is none"
 
 
 # The clocks
@@ -156,7 +156,7 @@ def test_relays_that_agree_with_a_reception_blame_the_anchor_s_clock(sign, facto
 @beyond
 def test_noise_grows_while_a_running_mean_is_off_zero(factor, is_beyond):
     s, gain = state(), TUNING.mean_gain
-    a, expected = s.anchors[1], 10.0 * (TUNING.noise_growth if is_beyond else TUNING.noise_loss)
+    a, loss = s.anchors[1], (TUNING.noise_loss, 1.0 - TUNING.mean_gain, TUNING.noise_loss)
     a.relay_mean = a.change_mean = s.status.common_mean = mean = 0.1
     a.walk_scale = a.change_scale = s.status.walk_scale = 10.0
     normalised = (OFF_ZERO * factor - (1.0 - gain) * mean) / gain
@@ -164,7 +164,8 @@ def test_noise_grows_while_a_running_mean_is_off_zero(factor, is_beyond):
     monitor.adapt_change_noise(s, 1, normalised)
     monitor.adapt_process_noise(s, normalised)
     assert [a.relay_mean, a.change_mean, s.status.common_mean] == [near(OFF_ZERO * factor)] * 3
-    assert [a.walk_scale, a.change_scale, s.status.walk_scale] == [near(expected)] * 3
+    expected = [near(10.0 * (TUNING.noise_growth if is_beyond else one)) for one in loss]
+    assert [a.walk_scale, a.change_scale, s.status.walk_scale] == expected
     a.relay_mean = a.change_mean = s.status.common_mean = 10.0 if is_beyond else 0.0
     largest = (TUNING.max_walk_scale, TUNING.max_scale, TUNING.max_walk_scale)
     a.walk_scale, a.change_scale, s.status.walk_scale = largest if is_beyond else (1.0, 1.0, 1.0)
@@ -252,9 +253,10 @@ def test_innovations_are_counted_and_averaged(is_difference):
 
 
 def test_large_innovations_weigh_less_where_they_may_be_late():
-    s = state()
-    for share, scales in ((0.0, (1.0, 1.0, 1.0, 0.0)), (0.1, (1.0, 4.0 / 3.0, 4.0 / 3.0, 0.0))):
-        s.status.late_share = share
+    s, full, less = state(), (1.0, 1.0, 1.0, 0.0), (1.0, 4.0 / 3.0, 4.0 / 3.0, 0.0)
+    recent = 0.5 * TUNING.jump_rise
+    for share, jumps, scales in ((0.0, recent, full), (0.1, 0.0, less), (0.0, recent * (1.0 + HAIR), less)):
+        s.status.late_share, s.status.obstruction = share, jumps
         found = [monitor.variance_scale(s, one, False) for one in (1.4, 2.0, -2.0, s.settings.gate + 0.1)]
         assert found == [near(scale) for scale in scales]
         found = [monitor.variance_scale(s, one, True) for one in (0.9, 2.0, -2.0, s.settings.gate + 0.1)]

@@ -200,7 +200,7 @@ def begin_obstruction(s: State, anchor: int) -> None:
     a = s.anchors[anchor]
     a.outliers_in_row = 0
     a.is_obstructed = True
-    a.change_mean = 0.0
+    a.change_mean = a.ended_log_odds = 0.0
     a.change_scale = s.tuning.first_change_scale
     _note_jump(s)
 

@@ -176,6 +176,12 @@ def jump_share(s: State) -> float:
     return min(s.status.obstruction, 1.0)
 
 
+def clear_variance(s: State, anchor: int) -> float:
+    """Variance of the changing part of a range error that has not jumped."""
+    usual = max(s.anchors[anchor].change_variance_m2, s.status.place_variance_m2)
+    return usual + jump_share(s) * square(s.tuning.obstructed_std_m)
+
+
 def range_error_decay(s: State, anchor: int, dt: float, walked_m: float) -> tuple[float, float, float]:
     """Decay of an anchor's range errors over the time and the walked distance since its newest packet.
 
@@ -192,10 +198,10 @@ def range_error_decay(s: State, anchor: int, dt: float, walked_m: float) -> tupl
         variance = 0.5 * memory_s * tuning.obstructed_walk * a.change_scale
         kept = exp(-dt / memory_s)
     else:
-        place_variance = max(a.change_variance_m2, status.place_variance_m2)
-        variance = place_variance + share * square(tuning.obstructed_std_m)
+        variance = clear_variance(s, anchor)  # of two processes as one, whose rates are weighted by their variances
+        after_jumps = share * square(tuning.obstructed_std_m) / max(variance, 1e-9)
         usual = dt / settings.place_time_s + walked_m / status.place_distance_m
-        kept = exp(-obstructed - (1.0 - share) * usual)
+        kept = exp(-after_jumps * dt / tuning.obstructed_s - (1.0 - after_jumps) * usual)
     kept_constant = exp(-obstructed) if obstructed > 1e-6 and settings.range_std_m > 0.0 else 1.0
     return kept, variance, kept_constant
 

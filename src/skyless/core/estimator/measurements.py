@@ -14,10 +14,10 @@ from typing import Final
 
 from skyless.core.estimator.faults import end_lasting_fault, is_late_often, subtract_fault_input
 from skyless.core.estimator.kalman import (
+    clear_variance,
     compute_fault_input,
     compute_ph,
     finish_updates,
-    jump_share,
     open_direction,
     relax_range_error,
     reset_state,
@@ -29,7 +29,7 @@ from skyless.core.estimator.monitor import (
     adapt_change_variance,
     adapt_clock_noise,
     adapt_process_noise,
-    end_small_obstruction,
+    has_ended,
     has_jumped,
     is_common,
     is_of_clock,
@@ -196,6 +196,9 @@ def own_reception(s: State, anchor: int, rx_ticks: Ticks, tx_ticks: Ticks, varia
     innovation = (rx_ticks - tx_ticks - a.offset_ticks) * TICK_M - expected_m
     innovation_variance = compute_ph(s) + rx_variance
     a.range_m = range_m
+    if has_ended(s, anchor, 1.0, innovation, innovation_variance):
+        innovation += end_obstruction(s, anchor)
+        innovation_variance = compute_ph(s) + rx_variance
     if not a.has_rate:
         innovation_variance += (variance_factor - 1.0) * settings.rx_variance_m2
         compute_fault_input(s, anchor)
@@ -219,21 +222,29 @@ def own_reception(s: State, anchor: int, rx_ticks: Ticks, tx_ticks: Ticks, varia
             innovation_variance = compute_ph(s) + rx_variance
             if innovation < -settings.gate * sqrt(innovation_variance):
                 return CLOCK_JUMPED
+    is_used = _use_reception(s, anchor, innovation, innovation_variance, variance_factor)
+    if is_used:
+        adapt_change_variance(s, anchor, elapsed_s)
+    _carry_ticks(s, anchor)
+    return USED if is_used else UNUSED
+
+
+def _use_reception(
+    s: State, anchor: int, innovation: float, innovation_variance: float, variance_factor: float
+) -> bool:
+    """Queue the update by a reception, and adapt the process noise; False if it is beyond the gate."""
     note_innovation(s, innovation, innovation_variance, False)
     normalised = innovation / sqrt(innovation_variance)
     scale = variance_scale(s, normalised, False)
     if scale > 0.0:
-        end_small_obstruction(s, anchor)
-        if a.is_obstructed:
+        if s.anchors[anchor].is_obstructed:
             adapt_change_noise(s, anchor, normalised)
         if is_warm(s):
             adapt_process_noise(s, normalised / scale)
-        used_variance = innovation_variance * scale + (variance_factor - 1.0) * settings.rx_variance_m2
+        used_variance = innovation_variance * scale + (variance_factor - 1.0) * s.settings.rx_variance_m2
         compute_fault_input(s, anchor)
         update_later(s, innovation, used_variance)
-        adapt_change_variance(s, anchor, elapsed_s)
-    _carry_ticks(s, anchor)
-    return USED if scale > 0.0 else UNUSED
+    return scale > 0.0
 
 
 def _carry_ticks(s: State, anchor: int) -> None:
@@ -242,6 +253,18 @@ def _carry_ticks(s: State, anchor: int) -> None:
     steps = floor(s.x[offset] / TICK_M)
     s.anchors[anchor].offset_ticks += steps
     s.x[offset] -= steps * TICK_M
+
+
+def end_obstruction(s: State, anchor: int) -> float:
+    """End an obstruction, or a fault that existed since the anchor joined. Returns what its innovation grows by."""
+    a, before_m = s.anchors[anchor], h_dot_x(s, 0)
+    if a.is_obstructed:
+        reset_state(s, s.layout.change + anchor, clear_variance(s, anchor))
+    else:
+        end_lasting_fault(s, anchor)
+    a.is_obstructed = False
+    a.outliers_in_row = 0
+    return before_m - h_dot_x(s, 0)
 
 
 def _jump(s: State, anchor: int, innovation: float, rx_variance: float) -> float:
@@ -253,21 +276,11 @@ def _jump(s: State, anchor: int, innovation: float, rx_variance: float) -> float
     Returns the remaining innovation. If that is earlier than antennas explain and packets are often late, the range
     error is not opened: the first packet, which initialised the anchor's clock, was late.
     """
-    a, tuning = s.anchors[anchor], s.tuning
     if innovation < 0.0:
-        before_m = h_dot_x(s, 0)
-        if a.is_obstructed:
-            variance = a.change_variance_m2 + jump_share(s) * square(tuning.obstructed_std_m)
-            reset_state(s, s.layout.change + anchor, variance)
-        else:
-            end_lasting_fault(s, anchor)
-        innovation += before_m - h_dot_x(s, 0)
-        a.is_obstructed = False
-        a.outliers_in_row = 0
-        s.status.ends_of_obstructions += 1
+        innovation += end_obstruction(s, anchor)
         if innovation * innovation <= square(s.settings.gate) * (compute_ph(s) + rx_variance):
             return innovation
-    if innovation > -tuning.lasting_std_m or not is_late_often(s):
+    if innovation > -s.tuning.lasting_std_m or not is_late_often(s):
         open_range_error(s, anchor, innovation)
     return innovation
 
@@ -556,6 +569,11 @@ def difference(s: State, a: int, b: int, rx_ticks: Ticks, difference_m: float) -
     expected_m = difference_terms(s, a, b)
     innovation = difference_m - expected_m - h_dot_x(s, 2 * direction_terms(s))
     innovation_variance = compute_ph(s) + square(settings.difference_std_m)
+    for far in range(2):
+        anchor = b if far == 1 else a
+        if has_ended(s, anchor, 2.0 * far - 1.0, innovation, innovation_variance):
+            innovation += end_obstruction(s, anchor)
+            innovation_variance = compute_ph(s) + square(settings.difference_std_m)
     note_innovation(s, innovation, innovation_variance, True)
     normalised = innovation / sqrt(innovation_variance)
     scale = variance_scale(s, normalised, True)
@@ -568,8 +586,6 @@ def difference(s: State, a: int, b: int, rx_ticks: Ticks, difference_m: float) -
     update_later(s, innovation, innovation_variance * scale)
     finish_updates(s)
     _bound_changes(s)
-    end_small_obstruction(s, a)
-    end_small_obstruction(s, b)
     adapt_change_variance(s, a, a_elapsed_s)
     adapt_change_variance(s, b, b_elapsed_s)
     return USED

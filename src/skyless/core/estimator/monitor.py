@@ -20,7 +20,7 @@ from typing import Final
 
 from skyless.core.estimator.faults import begin_obstruction, is_late_often
 from skyless.core.estimator.hypotheses import scatter
-from skyless.core.estimator.kalman import finish_updates, follows_cycles
+from skyless.core.estimator.kalman import clear_variance, finish_updates, follows_cycles, jump_share
 from skyless.core.estimator.state import CHANGING_RANGE_ERRORS, State, at, make_uncertain
 from skyless.core.native.arithmetic import log, sqrt, square
 from skyless.core.native.records import MOTION_STATES, PHASE_STATES
@@ -94,10 +94,14 @@ def open_range_error(s: State, anchor: int, innovation: float) -> None:
 
 
 def adapt_change_noise(s: State, anchor: int, normalised: float) -> None:
-    """Adapt the process noise of an obstructed anchor's range error to an innovation."""
+    """Adapt the process noise of an obstructed anchor's range error to an innovation.
+
+    It becomes smaller soon: if it were large, the error's end would look like another change.
+    """
     a = s.anchors[anchor]
     a.change_mean += s.tuning.mean_gain * (normalised - a.change_mean)
-    a.change_scale = _adapted(s, a.change_scale, _is_off_zero(s, a.change_mean), 1.0, s.tuning.max_scale)
+    a.change_scale *= s.tuning.noise_growth if _is_off_zero(s, a.change_mean) else 1.0 - s.tuning.mean_gain
+    a.change_scale = min(max(a.change_scale, 1.0), s.tuning.max_scale)
 
 
 def _adapted(s: State, scale: float, is_too_small: bool, least: float, largest: float) -> float:
@@ -112,14 +116,22 @@ def _is_off_zero(s: State, mean: float) -> bool:
     return mean * mean * (2.0 - gain) / gain > square(s.tuning.suspect)
 
 
-def end_small_obstruction(s: State, anchor: int) -> None:
-    """End an obstruction that has disappeared without a jump: the range error is known and close to zero."""
-    tuning, a, change = s.tuning, s.anchors[anchor], s.layout.change + anchor
-    error_m, variance, usual = s.x[change], s.P[at(change, change)], s.status.place_variance_m2
-    settled = a.is_obstructed and variance < square(tuning.ended_std_m) + usual
-    if settled and error_m * error_m < square(tuning.ended) * (variance + usual):
-        a.is_obstructed = False
-        s.status.ends_of_obstructions += 1
+def has_ended(s: State, anchor: int, sign: float, innovation: float, innovation_variance: float) -> bool:
+    """Whether measurements of an obstructed anchor are more likely without its range error, by their likelihoods.
+
+    The logarithms of the ratios are summed from the first one on that favours the end (CUSUM, Page 1954). P·h of the
+    newest measurement, which contains the range error with ``sign``, is the first of ``U``.
+    """
+    a, change = s.anchors[anchor], s.layout.change + anchor
+    if not a.is_obstructed:
+        return False
+    left_m = innovation + sign * s.x[change]
+    left_variance = innovation_variance - 2.0 * sign * s.U[0][change] + s.P[at(change, change)]
+    left_variance = max(left_variance, s.settings.rx_variance_m2) + clear_variance(s, anchor)
+    shown = square(innovation) / innovation_variance - square(left_m) / left_variance
+    a.ended_log_odds += 0.5 * (shown + log(innovation_variance / left_variance))
+    a.ended_log_odds = max(a.ended_log_odds, 0.0)
+    return a.ended_log_odds > s.tuning.ended_log_odds
 
 
 def note_innovation(s: State, innovation: float, innovation_variance: float, is_difference: bool) -> None:
@@ -150,15 +162,16 @@ def is_within_gate(s: State, normalised: float) -> bool:
 def variance_scale(s: State, normalised: float, is_difference: bool) -> float:
     """Factor on the variance of a measurement with this normalised innovation; 0 beyond the gate.
 
-    Large innovations are down-weighted if receptions are often late, and always in time differences, of which either
-    anchor may be late.
+    Large innovations are down-weighted if receptions are often late or a range error has just jumped, as the next one
+    may, and always in time differences, of which either anchor may be late.
     """
     tuning = s.tuning
     if not is_within_gate(s, normalised):
         return 0.0
     if is_difference:
         return max(1.0, abs(normalised) / tuning.difference_huber)
-    return max(1.0, abs(normalised) / tuning.reception_huber) if is_late_often(s) else 1.0
+    may_be_late = is_late_often(s) or jump_share(s) > 0.5 * tuning.jump_rise
+    return max(1.0, abs(normalised) / tuning.reception_huber) if may_be_late else 1.0
 
 
 def adapt_change_variance(s: State, anchor: int, elapsed_s: float) -> None:

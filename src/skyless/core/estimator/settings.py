@@ -134,7 +134,8 @@ class Tuning(Record):
     late_often_share: float = 0.02
     """Share of late receptions beyond which single receptions are often late."""
     reception_huber: float = 1.5
-    """Normalised innovation beyond which receptions are down-weighted if they are often late (Huber 1964)."""
+    """Normalised innovation beyond which receptions are down-weighted if they are often late, or one has just jumped
+    (Huber 1964)."""
     difference_huber: float = 1.0
     """The same for time differences, always."""
     max_relays_rejected: float = 4.0
@@ -154,12 +155,10 @@ class Tuning(Record):
     """… and the number if single receptions are often late."""
     together: float = 7.0
     """Sum of two such normalised innovations, reached by chance once in some million packets."""
-    first_change_scale: float = 10.0
+    first_change_scale: float = 20.0
     """Factor on the process noise of a range error that has just jumped, as it may still be changing."""
-    ended_std_m: float = 0.05
-    """An obstruction has ended once the range error is known to this [m] …"""
-    ended: float = 2.0
-    """… and is within this number of standard deviations of zero."""
+    ended_log_odds: float = 7.0
+    """Logarithm of the odds for no range error at which an obstruction has ended."""
     obstructed_walk: float = 0.004
     """Spectral density of the random walk of a range error that has jumped [m²/s]."""
     obstruction_memory_s: float = 10.0
@@ -168,7 +167,7 @@ class Tuning(Record):
     """Largest return in that time [m]: long delays are no less likely to stay."""
     jump_rise: float = 0.5
     """Fraction of its full size by which a jump raises the process noise of all range errors."""
-    obstructed_std_m: float = 0.05
+    obstructed_std_m: float = 0.04
     """Standard deviation by which all range errors change after jumps [m] …"""
     obstructed_s: float = 5.0
     """… and the time constant of that change [s]."""

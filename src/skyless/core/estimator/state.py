@@ -139,6 +139,8 @@ class Anchor(Record):
     """Running mean of its normalised innovations since then."""
     change_scale: float
     """Factor on the process noise of a range error that has jumped."""
+    ended_log_odds: float
+    """Logarithm of the odds that it has returned to zero."""
     has_fault: bool
     """Whether a lasting fault of it has been added to the state."""
     relay_mean: float
@@ -313,7 +315,6 @@ class Status(Record):
     reports_rejected: Count
     clock_restarts: Count
     obstructions: Count
-    ends_of_obstructions: Count
     faults_opened: Count
     mean_nis: float
     mean_square_m2: float

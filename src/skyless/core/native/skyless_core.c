@@ -185,6 +185,7 @@ INTERNAL void advance(State *s, real dt);
 INTERNAL void advance_packed(State *s, int32_t values, real dt);
 INTERNAL void add_noise(State *s, int32_t value, int32_t other, real of_values, real of_both, real of_rates);
 INTERNAL real jump_share(State *s);
+INTERNAL real clear_variance(State *s, int32_t anchor);
 INTERNAL range_error_decay_results range_error_decay(State *s, int32_t anchor, real dt, real walked_m);
 INTERNAL void relax_range_error(State *s, int32_t anchor, real dt, real walked_m);
 INTERNAL void decay(State *s, int32_t state, real kept, real variance);
@@ -240,7 +241,7 @@ INTERNAL void open_range_error(State *s, int32_t anchor, real innovation);
 INTERNAL void adapt_change_noise(State *s, int32_t anchor, real normalised);
 INTERNAL real adapted(State *s, real scale, bool is_too_small, real least, real largest);
 INTERNAL bool is_off_zero(State *s, real mean);
-INTERNAL void end_small_obstruction(State *s, int32_t anchor);
+INTERNAL bool has_ended(State *s, int32_t anchor, real sign, real innovation, real innovation_variance);
 INTERNAL void note_innovation(State *s, real innovation, real innovation_variance, bool is_difference);
 INTERNAL bool is_within_gate(State *s, real normalised);
 INTERNAL real variance_scale(State *s, real normalised, bool is_difference);
@@ -270,7 +271,9 @@ INTERNAL void add_range_errors(State *s, int32_t anchor, real sign);
 INTERNAL real find_curvature_m(State *s, real range_m, real variance);
 INTERNAL real reception_terms(State *s, int32_t anchor, bool has_tx_noise);
 INTERNAL int32_t own_reception(State *s, int32_t anchor, int64_t rx_ticks, int64_t tx_ticks, real variance_factor);
+INTERNAL bool use_reception(State *s, int32_t anchor, real innovation, real innovation_variance, real variance_factor);
 INTERNAL void carry_ticks(State *s, int32_t anchor);
+INTERNAL real end_obstruction(State *s, int32_t anchor);
 INTERNAL real jump(State *s, int32_t anchor, real innovation, real rx_variance);
 INTERNAL void first_reception(State *s, int32_t anchor, int64_t rx_ticks, int64_t tx_ticks, real variance_factor);
 INTERNAL void open_state(State *s, int32_t state, int32_t own, real variance);
@@ -2301,6 +2304,12 @@ INTERNAL real jump_share(State *s) {
     return min_real(s->status.obstruction, REAL(1.0));
 }
 
+/* Variance of the changing part of a range error that has not jumped. */
+INTERNAL real clear_variance(State *s, int32_t anchor) {
+    real usual = max_real(s->anchors[anchor].change_variance_m2, s->status.place_variance_m2);
+    return usual + jump_share(s) * square(s->tuning.obstructed_std_m);
+}
+
 /* Decay of an anchor's range errors over the time and the walked distance since its newest packet.
  *
  * Returns the kept share of the changing part, its long-term variance, and the kept share of the constant part. The
@@ -2322,10 +2331,10 @@ INTERNAL range_error_decay_results range_error_decay(State *s, int32_t anchor, r
         variance = REAL(0.5) * memory_s * tuning->obstructed_walk * a->change_scale;
         kept = exp_(-dt / memory_s);
     } else {
-        real place_variance = max_real(a->change_variance_m2, status->place_variance_m2);
-        variance = place_variance + share * square(tuning->obstructed_std_m);
+        variance = clear_variance(s, anchor);  /* of two processes as one, whose rates are weighted by their variances */
+        real after_jumps = share * square(tuning->obstructed_std_m) / max_real(variance, REAL(1e-09));
         real usual = dt / settings->place_time_s + walked_m / status->place_distance_m;
-        kept = exp_(-obstructed - (REAL(1.0) - share) * usual);
+        kept = exp_(-after_jumps * dt / tuning->obstructed_s - (REAL(1.0) - after_jumps) * usual);
     }
     real kept_constant = obstructed > REAL(1e-06) && settings->range_std_m > REAL(0.0) ? exp_(-obstructed) : REAL(1.0);
     return (range_error_decay_results){kept, variance, kept_constant};
@@ -2820,6 +2829,7 @@ INTERNAL void begin_obstruction(State *s, int32_t anchor) {
     Anchor *a = &s->anchors[anchor];
     a->outliers_in_row = 0;
     a->is_obstructed = true;
+    a->ended_log_odds = REAL(0.0);
     a->change_mean = REAL(0.0);
     a->change_scale = s->tuning.first_change_scale;
     note_jump(s);
@@ -3248,11 +3258,14 @@ INTERNAL void open_range_error(State *s, int32_t anchor, real innovation) {
     make_uncertain(s, CHANGING_RANGE_ERRORS);
 }
 
-/* Adapt the process noise of an obstructed anchor's range error to an innovation. */
+/* Adapt the process noise of an obstructed anchor's range error to an innovation.
+ *
+ * It becomes smaller soon: if it were large, the error's end would look like another change. */
 INTERNAL void adapt_change_noise(State *s, int32_t anchor, real normalised) {
     Anchor *a = &s->anchors[anchor];
     a->change_mean += s->tuning.mean_gain * (normalised - a->change_mean);
-    a->change_scale = adapted(s, a->change_scale, is_off_zero(s, a->change_mean), REAL(1.0), s->tuning.max_scale);
+    a->change_scale *= is_off_zero(s, a->change_mean) ? s->tuning.noise_growth : REAL(1.0) - s->tuning.mean_gain;
+    a->change_scale = min_real(max_real(a->change_scale, REAL(1.0)), s->tuning.max_scale);
 }
 
 /* Factor on process noise after an innovation, which shows whether the noise is too small. */
@@ -3267,19 +3280,23 @@ INTERNAL bool is_off_zero(State *s, real mean) {
     return mean * mean * (REAL(2.0) - gain) / gain > square(s->tuning.suspect);
 }
 
-/* End an obstruction that has disappeared without a jump: the range error is known and close to zero. */
-INTERNAL void end_small_obstruction(State *s, int32_t anchor) {
-    Tuning *tuning = &s->tuning;
+/* Whether measurements of an obstructed anchor are more likely without its range error, by their likelihoods.
+ *
+ * The logarithms of the ratios are summed from the first one on that favours the end (CUSUM, Page 1954). P·h of the
+ * newest measurement, which contains the range error with ``sign``, is the first of ``U``. */
+INTERNAL bool has_ended(State *s, int32_t anchor, real sign, real innovation, real innovation_variance) {
     Anchor *a = &s->anchors[anchor];
     int32_t change = s->layout.change + anchor;
-    real error_m = s->x[change];
-    real variance = s->P[at(change, change)];
-    real usual = s->status.place_variance_m2;
-    bool settled = a->is_obstructed && variance < square(tuning->ended_std_m) + usual;
-    if (settled && error_m * error_m < square(tuning->ended) * (variance + usual)) {
-        a->is_obstructed = false;
-        s->status.ends_of_obstructions += 1;
+    if (!a->is_obstructed) {
+        return false;
     }
+    real left_m = innovation + sign * s->x[change];
+    real left_variance = innovation_variance - REAL(2.0) * sign * s->U[0][change] + s->P[at(change, change)];
+    left_variance = max_real(left_variance, s->settings.rx_variance_m2) + clear_variance(s, anchor);
+    real shown = square(innovation) / innovation_variance - square(left_m) / left_variance;
+    a->ended_log_odds += REAL(0.5) * (shown + log_(innovation_variance / left_variance));
+    a->ended_log_odds = max_real(a->ended_log_odds, REAL(0.0));
+    return a->ended_log_odds > s->tuning.ended_log_odds;
 }
 
 /* Count an innovation as rejected or accepted, and update the running means. */
@@ -3312,8 +3329,8 @@ INTERNAL bool is_within_gate(State *s, real normalised) {
 
 /* Factor on the variance of a measurement with this normalised innovation; 0 beyond the gate.
  *
- * Large innovations are down-weighted if receptions are often late, and always in time differences, of which either
- * anchor may be late. */
+ * Large innovations are down-weighted if receptions are often late or a range error has just jumped, as the next one
+ * may, and always in time differences, of which either anchor may be late. */
 INTERNAL real variance_scale(State *s, real normalised, bool is_difference) {
     Tuning *tuning = &s->tuning;
     if (!is_within_gate(s, normalised)) {
@@ -3322,7 +3339,8 @@ INTERNAL real variance_scale(State *s, real normalised, bool is_difference) {
     if (is_difference) {
         return max_real(REAL(1.0), abs_real(normalised) / tuning->difference_huber);
     }
-    return is_late_often(s) ? max_real(REAL(1.0), abs_real(normalised) / tuning->reception_huber) : REAL(1.0);
+    bool may_be_late = is_late_often(s) || jump_share(s) > REAL(0.5) * tuning->jump_rise;
+    return may_be_late ? max_real(REAL(1.0), abs_real(normalised) / tuning->reception_huber) : REAL(1.0);
 }
 
 /* Track the variance of an anchor's changing range error: the mean square of its estimate.
@@ -3934,6 +3952,10 @@ INTERNAL int32_t own_reception(State *s, int32_t anchor, int64_t rx_ticks, int64
     real innovation = (real)(rx_ticks - tx_ticks - a->offset_ticks) * TICK_M - expected_m;
     real innovation_variance = compute_ph(s) + rx_variance;
     a->range_m = range_m;
+    if (has_ended(s, anchor, REAL(1.0), innovation, innovation_variance)) {
+        innovation += end_obstruction(s, anchor);
+        innovation_variance = compute_ph(s) + rx_variance;
+    }
     if (!a->has_rate) {
         innovation_variance += (variance_factor - REAL(1.0)) * settings->rx_variance_m2;
         compute_fault_input(s, anchor);
@@ -3964,24 +3986,31 @@ INTERNAL int32_t own_reception(State *s, int32_t anchor, int64_t rx_ticks, int64
             }
         }
     }
+    bool is_used = use_reception(s, anchor, innovation, innovation_variance, variance_factor);
+    if (is_used) {
+        adapt_change_variance(s, anchor, elapsed_s);
+    }
+    carry_ticks(s, anchor);
+    return is_used ? USED : UNUSED;
+}
+
+/* Queue the update by a reception, and adapt the process noise; False if it is beyond the gate. */
+INTERNAL bool use_reception(State *s, int32_t anchor, real innovation, real innovation_variance, real variance_factor) {
     note_innovation(s, innovation, innovation_variance, false);
     real normalised = innovation / SQRT(innovation_variance);
     real scale = variance_scale(s, normalised, false);
     if (scale > REAL(0.0)) {
-        end_small_obstruction(s, anchor);
-        if (a->is_obstructed) {
+        if (s->anchors[anchor].is_obstructed) {
             adapt_change_noise(s, anchor, normalised);
         }
         if (is_warm(s)) {
             adapt_process_noise(s, normalised / scale);
         }
-        real used_variance = innovation_variance * scale + (variance_factor - REAL(1.0)) * settings->rx_variance_m2;
+        real used_variance = innovation_variance * scale + (variance_factor - REAL(1.0)) * s->settings.rx_variance_m2;
         compute_fault_input(s, anchor);
         update_later(s, innovation, used_variance);
-        adapt_change_variance(s, anchor, elapsed_s);
     }
-    carry_ticks(s, anchor);
-    return scale > REAL(0.0) ? USED : UNUSED;
+    return scale > REAL(0.0);
 }
 
 /* Move whole ticks of an offset state into ``offset_ticks``. */
@@ -3992,6 +4021,20 @@ INTERNAL void carry_ticks(State *s, int32_t anchor) {
     s->x[offset] -= (real)steps * TICK_M;
 }
 
+/* End an obstruction, or a fault that existed since the anchor joined. Returns what its innovation grows by. */
+INTERNAL real end_obstruction(State *s, int32_t anchor) {
+    Anchor *a = &s->anchors[anchor];
+    real before_m = h_dot_x(s, 0);
+    if (a->is_obstructed) {
+        reset_state(s, s->layout.change + anchor, clear_variance(s, anchor));
+    } else {
+        end_lasting_fault(s, anchor);
+    }
+    a->is_obstructed = false;
+    a->outliers_in_row = 0;
+    return before_m - h_dot_x(s, 0);
+}
+
 /* Handle a jump of an anchor's range error: back to the value before an obstruction, or to a new one.
  *
  * Obstacles make packets late. So an early jump of an anchor not known to be obstructed ends an obstruction that
@@ -4000,25 +4043,13 @@ INTERNAL void carry_ticks(State *s, int32_t anchor) {
  * Returns the remaining innovation. If that is earlier than antennas explain and packets are often late, the range
  * error is not opened: the first packet, which initialised the anchor's clock, was late. */
 INTERNAL real jump(State *s, int32_t anchor, real innovation, real rx_variance) {
-    Anchor *a = &s->anchors[anchor];
-    Tuning *tuning = &s->tuning;
     if (innovation < REAL(0.0)) {
-        real before_m = h_dot_x(s, 0);
-        if (a->is_obstructed) {
-            real variance = a->change_variance_m2 + jump_share(s) * square(tuning->obstructed_std_m);
-            reset_state(s, s->layout.change + anchor, variance);
-        } else {
-            end_lasting_fault(s, anchor);
-        }
-        innovation += before_m - h_dot_x(s, 0);
-        a->is_obstructed = false;
-        a->outliers_in_row = 0;
-        s->status.ends_of_obstructions += 1;
+        innovation += end_obstruction(s, anchor);
         if (innovation * innovation <= square(s->settings.gate) * (compute_ph(s) + rx_variance)) {
             return innovation;
         }
     }
-    if (innovation > -tuning->lasting_std_m || !is_late_often(s)) {
+    if (innovation > -s->tuning.lasting_std_m || !is_late_often(s)) {
         open_range_error(s, anchor, innovation);
     }
     return innovation;
@@ -4346,6 +4377,13 @@ INTERNAL int32_t difference(State *s, int32_t a, int32_t b, int64_t rx_ticks, re
     real expected_m = difference_terms(s, a, b);
     real innovation = difference_m - expected_m - h_dot_x(s, 2 * direction_terms(s));
     real innovation_variance = compute_ph(s) + square(settings->difference_std_m);
+    for (int32_t far = 0; far < 2; far++) {
+        int32_t anchor = far == 1 ? b : a;
+        if (has_ended(s, anchor, REAL(2.0) * (real)far - REAL(1.0), innovation, innovation_variance)) {
+            innovation += end_obstruction(s, anchor);
+            innovation_variance = compute_ph(s) + square(settings->difference_std_m);
+        }
+    }
     note_innovation(s, innovation, innovation_variance, true);
     real normalised = innovation / SQRT(innovation_variance);
     real scale = variance_scale(s, normalised, true);
@@ -4360,8 +4398,6 @@ INTERNAL int32_t difference(State *s, int32_t a, int32_t b, int64_t rx_ticks, re
     update_later(s, innovation, innovation_variance * scale);
     finish_updates(s);
     bound_changes(s);
-    end_small_obstruction(s, a);
-    end_small_obstruction(s, b);
     adapt_change_variance(s, a, a_elapsed_s);
     adapt_change_variance(s, b, b_elapsed_s);
     return USED;
@@ -7772,21 +7808,21 @@ SKYLESS_EXPORT void skyless_begin_tag(Tag *t, int32_t site, real qa, real lowest
             = REAL(0.005), .late_often_share = REAL(0.02), .reception_huber = REAL(1.5), .difference_huber = REAL(1.0),
             .max_relays_rejected = REAL(4.0), .lost_in_row = REAL(8.0), .lost_share = REAL(0.5), .suspect = REAL(3.0),
             .in_row = REAL(2.0), .in_row_where_late = REAL(5.0), .together = REAL(7.0), .first_change_scale =
-            REAL(10.0), .ended_std_m = REAL(0.05), .ended = REAL(2.0), .obstructed_walk = REAL(0.004),
-            .obstruction_memory_s = REAL(10.0), .obstruction_return_m = REAL(0.2), .jump_rise = REAL(0.5),
-            .obstructed_std_m = REAL(0.05), .obstructed_s = REAL(5.0), .place_step_m = REAL(0.1), .place_first =
-            REAL(20.0), .place_samples = REAL(100.0), .place_memory = REAL(1000.0), .place_min_m2 = REAL(0.0012),
-            .place_kept = REAL(0.1), .max_change_std_m = REAL(0.5), .lasting_std_m = REAL(0.3), .recent_std_m =
-            REAL(0.08), .creeping_std_m = REAL(0.2), .recent_packets = REAL(16.0), .creeping_s = REAL(3.0), .late_std_m
-            = REAL(1.0), .sure_chi2 = REAL(50.0), .early_weight = REAL(0.8), .open_pair_std_m = REAL(0.1), .pair_relays
-            = REAL(12.0), .misplaced_pairs = REAL(2.0), .start_age_s = REAL(0.5), .curved_std = REAL(0.1),
-            .start_patience_s = REAL(0.5), .start_tail = REAL(0.0001), .new_start_s = REAL(1.0), .start_margin =
-            REAL(4.0), .short_silence_s = REAL(0.1), .longest_silence_s = REAL(5.0), .slow_superframe_s = REAL(0.2),
-            .slow_curved_std = REAL(0.7), .slow_start_std = REAL(2.0), .longest_superframe_s = REAL(1.3),
-            .heights_in_row = REAL(20.0), .open_survey_std_m = REAL(0.15), .fitting_chi2 = REAL(2.0), .most_late =
-            REAL(2.0), .late_penalty = REAL(2.0), .staying_share = REAL(0.2), .window = REAL(60.0), .window_s =
-            REAL(1.0), .moving_window = REAL(20.0), .moving_std_m = REAL(1.5), .moving_nis = REAL(1.5), .moving_apart =
-            REAL(6.0), .median_difference_std_m = REAL(0.08), .late_start_std_m = REAL(0.14), .rival_m = REAL(0.5),
+            REAL(20.0), .ended_log_odds = REAL(7.0), .obstructed_walk = REAL(0.004), .obstruction_memory_s = REAL(10.0),
+            .obstruction_return_m = REAL(0.2), .jump_rise = REAL(0.5), .obstructed_std_m = REAL(0.04), .obstructed_s =
+            REAL(5.0), .place_step_m = REAL(0.1), .place_first = REAL(20.0), .place_samples = REAL(100.0), .place_memory
+            = REAL(1000.0), .place_min_m2 = REAL(0.0012), .place_kept = REAL(0.1), .max_change_std_m = REAL(0.5),
+            .lasting_std_m = REAL(0.3), .recent_std_m = REAL(0.08), .creeping_std_m = REAL(0.2), .recent_packets =
+            REAL(16.0), .creeping_s = REAL(3.0), .late_std_m = REAL(1.0), .sure_chi2 = REAL(50.0), .early_weight =
+            REAL(0.8), .open_pair_std_m = REAL(0.1), .pair_relays = REAL(12.0), .misplaced_pairs = REAL(2.0),
+            .start_age_s = REAL(0.5), .curved_std = REAL(0.1), .start_patience_s = REAL(0.5), .start_tail =
+            REAL(0.0001), .new_start_s = REAL(1.0), .start_margin = REAL(4.0), .short_silence_s = REAL(0.1),
+            .longest_silence_s = REAL(5.0), .slow_superframe_s = REAL(0.2), .slow_curved_std = REAL(0.7),
+            .slow_start_std = REAL(2.0), .longest_superframe_s = REAL(1.3), .heights_in_row = REAL(20.0),
+            .open_survey_std_m = REAL(0.15), .fitting_chi2 = REAL(2.0), .most_late = REAL(2.0), .late_penalty =
+            REAL(2.0), .staying_share = REAL(0.2), .window = REAL(60.0), .window_s = REAL(1.0), .moving_window =
+            REAL(20.0), .moving_std_m = REAL(1.5), .moving_nis = REAL(1.5), .moving_apart = REAL(6.0),
+            .median_difference_std_m = REAL(0.08), .late_start_std_m = REAL(0.14), .rival_m = REAL(0.5),
             .height_margin_m = REAL(1.0), .neighbourhood = REAL(1.5), .most_horizontal_std_m = REAL(3.0),
             .zero_variance_m2 = REAL(10000.0), .phase_start_std_m = REAL(0.002), .phase_max_std_m = REAL(0.006),
             .phase_mesh_std_m = REAL(0.0012), .phase_wander = REAL(25.0), .phase_gate = REAL(0.35), .phase_share =

@@ -747,7 +747,8 @@ typedef struct Tuning {
     /* Weight in the shares of late receptions and of wild phases, and in the phases' noise: the last 200. */
     real slow_forgetting;
     real late_often_share;  /* Share of late receptions beyond which single receptions are often late. */
-    /* Normalised innovation beyond which receptions are down-weighted if they are often late (Huber 1964). */
+    /* Normalised innovation beyond which receptions are down-weighted if they are often late, or one has just jumped
+     * (Huber 1964). */
     real reception_huber;
     real difference_huber;  /* The same for time differences, always. */
     real max_relays_rejected;  /* Count of recent relays beyond the gate that late packets may explain. */
@@ -762,8 +763,7 @@ typedef struct Tuning {
     real together;  /* Sum of two such normalised innovations, reached by chance once in some million packets. */
     /* Factor on the process noise of a range error that has just jumped, as it may still be changing. */
     real first_change_scale;
-    real ended_std_m;  /* An obstruction has ended once the range error is known to this [m] … */
-    real ended;  /* … and is within this number of standard deviations of zero. */
+    real ended_log_odds;  /* Logarithm of the odds for no range error at which an obstruction has ended. */
     real obstructed_walk;  /* Spectral density of the random walk of a range error that has jumped [m²/s]. */
     real obstruction_memory_s;  /* Time constant of its return to zero, and of forgetting a jump [s]. */
     real obstruction_return_m;  /* Largest return in that time [m]: long delays are no less likely to stay. */
@@ -1016,7 +1016,6 @@ typedef struct Status {
     int64_t reports_rejected;
     int64_t clock_restarts;
     int64_t obstructions;
-    int64_t ends_of_obstructions;
     int64_t faults_opened;
     real mean_nis;
     real mean_square_m2;  /* Mean square of innovations. */
@@ -1148,6 +1147,7 @@ typedef struct Anchor {
     bool is_obstructed;  /* Whether its range error has jumped and not returned. */
     real change_mean;  /* Running mean of its normalised innovations since then. */
     real change_scale;  /* Factor on the process noise of a range error that has jumped. */
+    real ended_log_odds;  /* Logarithm of the odds that it has returned to zero. */
     bool has_fault;  /* Whether a lasting fault of it has been added to the state. */
     real relay_mean;  /* Running mean of its clock's normalised innovations in relays. */
     real walk_scale;  /* Factor on its oscillator's random walk. */
