@@ -45,10 +45,10 @@ DIFFERENCES = "skyless.run.masterless.difference_tracking:"
 MECHANISMS: dict[str, dict[str, float]] = {
     "": {},
     "Jumps of range errors": {"in_row": OFF, "in_row_where_late": OFF},
-    "… widen all range errors": {"jump_rise": 0.0},
+    "… widen all range errors": {"obstructed_std_m": 0.0, "obstructed_s": OFF},
     "… may still be changing": {"first_change_scale": 1.0},
     "… of more than 20 cm return slowly": {"obstruction_return_m": OFF},
-    "… end where receptions are likelier without": {"ended_log_odds": OFF},
+    "… end where receptions are likelier without them": {"ended_log_odds": OFF},
     "Single late packets": {"late_often_share": OFF},
     "… need more in a row for a jump": {"in_row_where_late": 2},
     "… less weight of large innovations": {"reception_huber": OFF},

@@ -107,6 +107,26 @@ def test_a_path_that_is_blocked_is_opened_and_closed_again(case, late_m, errors)
     assert hit_m < 1.6 * clean_m
 
 
+@pytest.mark.parametrize("share", [0.0, 0.1])
+def test_an_obstruction_outlasts_late_packets_and_ends_as_it_returns(share):
+    """0.3 m from 1.5 s to 3.75 s, which then vanish within a second."""
+    errors_m = []
+    for seed in range(4):
+        episode, draw, anchor = walking(superframes=700, seed=seed), np.random.default_rng(seed + 100), seed + 1
+        number = np.arange(len(episode.path_m))
+        late_m = np.where(number < 600, 0.0, np.clip(0.3 * (1900 - number) / 400, 0.0, 0.3))
+        single_m = np.where((draw.random(len(number)) < share) & (number > 200), draw.exponential(1.0, len(number)), 0)
+        packets = late(episode.packets, late_m * (episode.packets.anchors == anchor) + single_m)
+        estimator, marked = begun(episode, settings_of(AGILE, **ROOM_ERRORS), std_m=0.1), []
+        for k, packet in enumerate(one_by_one(packets)):
+            estimator.process(*packet)
+            marked.append(anchor in estimator.obstructed)
+            errors_m.append(estimator.position_m() - episode.path_m[k, :2])
+        assert all(marked[700:1500])
+        assert not any(marked[2900:])
+    assert rmse(np.array(errors_m)) < 0.035
+
+
 @CASES
 @pytest.mark.parametrize("share", [0.05, 0.2])
 def test_where_packets_are_often_late_few_are_believed_and_errors_stay_small(case, share):

@@ -83,34 +83,53 @@ def test_a_range_error_that_has_jumped_is_estimated_again():
     s = state(survey_std_m=0.0, range_std_m=0.0, slope_std_m=0.0, place_std_m=0.0)
     change = s.layout.change + 1
     assert s.status.range_errors == NO_RANGE_ERRORS
-    s.anchors[1].outliers_in_row, s.anchors[1].change_mean = 2, 1.0
-    monitor.open_range_error(s, 1, -0.7)
     a = s.anchors[1]
+    a.outliers_in_row, a.change_mean, a.ended_log_odds = 2, 1.0, 6.0
+    monitor.open_range_error(s, 1, -0.7)
+    assert a.ended_log_odds == 0.0
     assert (s.status.obstructions, a.is_obstructed, a.outliers_in_row, a.change_mean) == (1, True, 0, 0.0)
     assert (a.change_scale, s.status.obstruction) == (TUNING.first_change_scale, TUNING.jump_rise)
     assert s.P[at(change, change)] == near(0.49 + s.anchors[0].change_variance_m2)
     assert s.status.range_errors == CHANGING_RANGE_ERRORS
 
 
-def test_an_obstruction_ends_where_receptions_are_more_likely_without_its_error():
-    s = state()
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_an_obstruction_ends_where_measurements_are_more_likely_without_its_error(sign):
+    s, gate = state(), 4.0
     a, change, draw = s.anchors[1], s.layout.change + 1, np.random.default_rng(3)
     root = draw.normal(0.0, 0.02, (2, 2))
-    P, h, noise_m2 = root @ root.T + 1e-4 * np.eye(2), np.array([0.8, 1.0]), 0.002  # of the range, and its error
-    usual = TUNING.obstructed_std_m**2 * 0.5 + a.change_variance_m2
-    for sign in (1.0, -1.0):
-        h[1], s.status.obstruction, a.is_obstructed, a.ended_log_odds, summed = sign, 0.5, True, 0.0, 0.0
-        for innovation, error_m in ((0.1, 0.2), (-0.15, 0.2), (0.05, 0.0), (-0.2, 0.3), (-0.25, 0.25)):
-            s.x[change], s.P[at(change, change)], s.U[0][change] = sign * error_m, P[1, 1], P[1] @ h
-            with_it = h @ P @ h + noise_m2
-            without = h[0] ** 2 * P[0, 0] + usual + noise_m2
-            ratio = norm.logpdf(innovation + error_m, 0.0, without**0.5) - norm.logpdf(innovation, 0.0, with_it**0.5)
-            summed = max(summed + ratio, 0.0)
-            assert monitor.has_ended(s, 1, sign, innovation, with_it) == (summed > TUNING.ended_log_odds)
-            assert a.ended_log_odds == pytest.approx(summed)
-        assert summed > TUNING.ended_log_odds
-        a.is_obstructed = False
-        assert not monitor.has_ended(s, 1, sign, innovation, with_it), "there is none"
+    P, h, noise_m2 = root @ root.T + 1e-4 * np.eye(2), np.array([0.8, sign]), 0.002  # of the range, and its error
+    P[1, 1] += 0.1**2  # so that it is not known well
+    s.status.obstruction, s.status.place_variance_m2, a.is_obstructed, summed = 0.5, 0.03**2, True, 0.0
+    without = h[0] ** 2 * P[0, 0] + 0.5 * TUNING.obstructed_std_m**2 + 0.03**2 + noise_m2
+    with_it = h @ P @ h + noise_m2
+    for innovation, error_m in ((0.1, 0.2), (-0.15, 0.2), (0.05, 0.0), (9.0, 0.2), (-0.3, 0.3), (-0.3, 0.3)):
+        s.x[change], s.P[at(change, change)], s.U[0][change] = sign * error_m, P[1, 1], P[1] @ h
+        far_m, near_m = (
+            min(x, gate * v**0.5) for x, v in ((abs(innovation + error_m), without), (abs(innovation), with_it))
+        )
+        ratio = norm.logpdf(far_m, 0.0, without**0.5) - norm.logpdf(near_m, 0.0, with_it**0.5)
+        summed = max(summed + ratio, 0.0)
+        assert monitor.judge_end(s, 1, sign, innovation, with_it) == (summed > TUNING.ended_log_odds)
+        assert a.ended_log_odds == pytest.approx(summed)
+    assert summed > TUNING.ended_log_odds
+    monitor.judge_end(s, 1, sign, math.nan, with_it)
+    assert a.ended_log_odds == 0.0, "no number is no evidence"
+    s.U[0][change] = sign * 10.0
+    monitor.judge_end(s, 1, sign, -0.3, with_it)
+    least = s.settings.rx_variance_m2 + 0.5 * TUNING.obstructed_std_m**2 + 0.03**2
+    assert a.ended_log_odds == pytest.approx(0.5 * (0.09 / with_it + math.log(with_it / least)))
+    a.is_obstructed = False
+    assert not monitor.judge_end(s, 1, sign, innovation, with_it), "there is none"
+
+
+def test_an_obstruction_ends_once_its_error_is_small_and_known():
+    s = state()
+    change, limit = s.layout.change + 1, TUNING.ended_std_m**2 + s.anchors[1].change_variance_m2
+    s.anchors[1].is_obstructed, s.U[0][change] = True, 0.0
+    for error_m2, variance, is_over in ((1.0 - HAIR, 1.0 - HAIR, True), (1.1, 0.5, False), (0.5, 1.1, False)):
+        s.x[change], s.P[at(change, change)] = -math.sqrt(error_m2 * limit), variance * limit
+        assert monitor.judge_end(s, 1, 1.0, 0.0, 1e-3) is is_over
 
 
 # The clocks
@@ -159,6 +178,9 @@ def test_noise_grows_while_a_running_mean_is_off_zero(factor, is_beyond):
     a, loss = s.anchors[1], (TUNING.noise_loss, 1.0 - TUNING.mean_gain, TUNING.noise_loss)
     a.relay_mean = a.change_mean = s.status.common_mean = mean = 0.1
     a.walk_scale = a.change_scale = s.status.walk_scale = 10.0
+    monitor.adapt_change_noise(s, 1, 1.0)
+    assert a.change_mean == 0.1, "it is not obstructed"
+    a.is_obstructed = True
     normalised = (OFF_ZERO * factor - (1.0 - gain) * mean) / gain
     monitor.adapt_clock_noise(s, 1, normalised)
     monitor.adapt_change_noise(s, 1, normalised)
@@ -254,7 +276,7 @@ def test_innovations_are_counted_and_averaged(is_difference):
 
 def test_large_innovations_weigh_less_where_they_may_be_late():
     s, full, less = state(), (1.0, 1.0, 1.0, 0.0), (1.0, 4.0 / 3.0, 4.0 / 3.0, 0.0)
-    recent = 0.5 * TUNING.jump_rise
+    recent = TUNING.recent_jumps
     for share, jumps, scales in ((0.0, recent, full), (0.1, 0.0, less), (0.0, recent * (1.0 + HAIR), less)):
         s.status.late_share, s.status.obstruction = share, jumps
         found = [monitor.variance_scale(s, one, False) for one in (1.4, 2.0, -2.0, s.settings.gate + 0.1)]

@@ -186,8 +186,8 @@ def range_error_decay(s: State, anchor: int, dt: float, walked_m: float) -> tupl
     """Decay of an anchor's range errors over the time and the walked distance since its newest packet.
 
     Returns the kept share of the changing part, its long-term variance, and the kept share of the constant part. The
-    changing part is a Gauss–Markov process of walked distance and time. Where range errors jump, both parts are
-    forgotten within seconds; one that has jumped itself wanders and returns to zero.
+    changing part is a Gauss–Markov process of walked distance and time. Where range errors jump, a part of its variance
+    and the constant part are forgotten within seconds; one that has jumped itself wanders and returns to zero.
     """
     status, tuning, settings, a = s.status, s.tuning, s.settings, s.anchors[anchor]
     share = jump_share(s)

@@ -29,11 +29,11 @@ from skyless.core.estimator.monitor import (
     adapt_change_variance,
     adapt_clock_noise,
     adapt_process_noise,
-    has_ended,
     has_jumped,
     is_common,
     is_of_clock,
     is_warm,
+    judge_end,
     learn_place,
     note_innovation,
     note_outlier,
@@ -196,7 +196,7 @@ def own_reception(s: State, anchor: int, rx_ticks: Ticks, tx_ticks: Ticks, varia
     innovation = (rx_ticks - tx_ticks - a.offset_ticks) * TICK_M - expected_m
     innovation_variance = compute_ph(s) + rx_variance
     a.range_m = range_m
-    if has_ended(s, anchor, 1.0, innovation, innovation_variance):
+    if judge_end(s, anchor, 1.0, innovation, innovation_variance):
         innovation += end_obstruction(s, anchor)
         innovation_variance = compute_ph(s) + rx_variance
     if not a.has_rate:
@@ -237,8 +237,7 @@ def _use_reception(
     normalised = innovation / sqrt(innovation_variance)
     scale = variance_scale(s, normalised, False)
     if scale > 0.0:
-        if s.anchors[anchor].is_obstructed:
-            adapt_change_noise(s, anchor, normalised)
+        adapt_change_noise(s, anchor, normalised)
         if is_warm(s):
             adapt_process_noise(s, normalised / scale)
         used_variance = innovation_variance * scale + (variance_factor - 1.0) * s.settings.rx_variance_m2
@@ -458,7 +457,7 @@ def _survey_pair(s: State, one: int, other: int) -> None:
     a, survey = s.anchors[misplaced], s.layout.survey + s.dim * misplaced
     make_uncertain(s, ALL_RANGE_ERRORS)
     if a.is_obstructed:  # what seemed to be an obstacle
-        reset_state(s, s.layout.change + misplaced, a.change_variance_m2)
+        reset_state(s, s.layout.change + misplaced, clear_variance(s, misplaced))
         a.is_obstructed = False
     for axis in range(s.dim):
         s.P[at(survey + axis, survey + axis)] += square(s.tuning.lasting_std_m)
@@ -571,7 +570,7 @@ def difference(s: State, a: int, b: int, rx_ticks: Ticks, difference_m: float) -
     innovation_variance = compute_ph(s) + square(settings.difference_std_m)
     for far in range(2):
         anchor = b if far == 1 else a
-        if has_ended(s, anchor, 2.0 * far - 1.0, innovation, innovation_variance):
+        if judge_end(s, anchor, 2.0 * far - 1.0, innovation, innovation_variance):
             innovation += end_obstruction(s, anchor)
             innovation_variance = compute_ph(s) + square(settings.difference_std_m)
     note_innovation(s, innovation, innovation_variance, True)
@@ -586,6 +585,8 @@ def difference(s: State, a: int, b: int, rx_ticks: Ticks, difference_m: float) -
     update_later(s, innovation, innovation_variance * scale)
     finish_updates(s)
     _bound_changes(s)
+    adapt_change_noise(s, a, -normalised)
+    adapt_change_noise(s, b, normalised)
     adapt_change_variance(s, a, a_elapsed_s)
     adapt_change_variance(s, b, b_elapsed_s)
     return USED

@@ -94,14 +94,15 @@ def open_range_error(s: State, anchor: int, innovation: float) -> None:
 
 
 def adapt_change_noise(s: State, anchor: int, normalised: float) -> None:
-    """Adapt the process noise of an obstructed anchor's range error to an innovation.
+    """Adapt the process noise of an anchor's range error to an innovation, if it is obstructed.
 
     It becomes smaller soon: if it were large, the error's end would look like another change.
     """
     a = s.anchors[anchor]
-    a.change_mean += s.tuning.mean_gain * (normalised - a.change_mean)
-    a.change_scale *= s.tuning.noise_growth if _is_off_zero(s, a.change_mean) else 1.0 - s.tuning.mean_gain
-    a.change_scale = min(max(a.change_scale, 1.0), s.tuning.max_scale)
+    if a.is_obstructed:
+        a.change_mean += s.tuning.mean_gain * (normalised - a.change_mean)
+        a.change_scale *= s.tuning.noise_growth if _is_off_zero(s, a.change_mean) else 1.0 - s.tuning.mean_gain
+        a.change_scale = min(max(a.change_scale, 1.0), s.tuning.max_scale)
 
 
 def _adapted(s: State, scale: float, is_too_small: bool, least: float, largest: float) -> float:
@@ -116,22 +117,25 @@ def _is_off_zero(s: State, mean: float) -> bool:
     return mean * mean * (2.0 - gain) / gain > square(s.tuning.suspect)
 
 
-def has_ended(s: State, anchor: int, sign: float, innovation: float, innovation_variance: float) -> bool:
-    """Whether measurements of an obstructed anchor are more likely without its range error, by their likelihoods.
+def judge_end(s: State, anchor: int, sign: float, innovation: float, innovation_variance: float) -> bool:
+    """Sum the evidence of a measurement that an obstruction has ended, and return whether it has.
 
-    The logarithms of the ratios are summed from the first one on that favours the end (CUSUM, Page 1954). P·h of the
-    newest measurement, which contains the range error with ``sign``, is the first of ``U``.
+    Measurements are then more likely without the range error: the logarithms of the ratios are summed from the first
+    one on that favours the end (CUSUM, Page 1954), each squared error up to the gate, as single packets are late. An
+    error that returns slowly has ended once it is small, and known to be. P·h of the newest measurement, which contains
+    the range error with ``sign``, is the first of ``U``.
     """
-    a, change = s.anchors[anchor], s.layout.change + anchor
+    a, change, tuning, most = s.anchors[anchor], s.layout.change + anchor, s.tuning, square(s.settings.gate)
     if not a.is_obstructed:
         return False
-    left_m = innovation + sign * s.x[change]
-    left_variance = innovation_variance - 2.0 * sign * s.U[0][change] + s.P[at(change, change)]
-    left_variance = max(left_variance, s.settings.rx_variance_m2) + clear_variance(s, anchor)
-    shown = square(innovation) / innovation_variance - square(left_m) / left_variance
-    a.ended_log_odds += 0.5 * (shown + log(innovation_variance / left_variance))
-    a.ended_log_odds = max(a.ended_log_odds, 0.0)
-    return a.ended_log_odds > s.tuning.ended_log_odds
+    error_m, variance = s.x[change], s.P[at(change, change)]
+    left_variance = max(innovation_variance - 2.0 * sign * s.U[0][change] + variance, s.settings.rx_variance_m2)
+    left_variance += clear_variance(s, anchor)
+    shown = min(square(innovation) / innovation_variance, most)
+    shown -= min(square(innovation + sign * error_m) / left_variance, most)
+    a.ended_log_odds = max(0.0, a.ended_log_odds + 0.5 * (shown + log(innovation_variance / left_variance)))
+    small = square(tuning.ended_std_m) + max(a.change_variance_m2, s.status.place_variance_m2)
+    return a.ended_log_odds > tuning.ended_log_odds or max(variance, square(error_m)) < small
 
 
 def note_innovation(s: State, innovation: float, innovation_variance: float, is_difference: bool) -> None:
@@ -170,7 +174,7 @@ def variance_scale(s: State, normalised: float, is_difference: bool) -> float:
         return 0.0
     if is_difference:
         return max(1.0, abs(normalised) / tuning.difference_huber)
-    may_be_late = is_late_often(s) or jump_share(s) > 0.5 * tuning.jump_rise
+    may_be_late = is_late_often(s) or jump_share(s) > tuning.recent_jumps
     return max(1.0, abs(normalised) / tuning.reception_huber) if may_be_late else 1.0
 
 

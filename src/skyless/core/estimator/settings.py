@@ -27,7 +27,7 @@ class Tuning(Record):
     max_walk_scale: float = 1e4
     """Largest factor on the random walk of a clock; for the tag's, at once when all innovations are on one side."""
     noise_loss: float = 0.99
-    """… and its factor with every other innovation."""
+    """… and its factor with every other innovation; that of a range error has 1 − ``mean_gain``."""
     common: float = 1.5
     """If the normalised innovations of all anchors are beyond this on one side, the tag's clock has left its rate."""
     rate_s: float = 0.5
@@ -158,7 +158,9 @@ class Tuning(Record):
     first_change_scale: float = 20.0
     """Factor on the process noise of a range error that has just jumped, as it may still be changing."""
     ended_log_odds: float = 7.0
-    """Logarithm of the odds for no range error at which an obstruction has ended."""
+    """Sum of logarithms of odds for no range error at which an obstruction has ended …"""
+    ended_std_m: float = 0.05
+    """… as it has once the range error is smaller than this, and known to it [m]."""
     obstructed_walk: float = 0.004
     """Spectral density of the random walk of a range error that has jumped [m²/s]."""
     obstruction_memory_s: float = 10.0
@@ -167,6 +169,8 @@ class Tuning(Record):
     """Largest return in that time [m]: long delays are no less likely to stay."""
     jump_rise: float = 0.5
     """Fraction of its full size by which a jump raises the process noise of all range errors."""
+    recent_jumps: float = 0.25
+    """Fraction from which on the next jump is expected, and large innovations are down-weighted."""
     obstructed_std_m: float = 0.04
     """Standard deviation by which all range errors change after jumps [m] …"""
     obstructed_s: float = 5.0

@@ -140,7 +140,7 @@ class Anchor(Record):
     change_scale: float
     """Factor on the process noise of a range error that has jumped."""
     ended_log_odds: float
-    """Logarithm of the odds that it has returned to zero."""
+    """Sum of the logarithms of odds that it has returned to zero, since they began to show it."""
     has_fault: bool
     """Whether a lasting fault of it has been added to the state."""
     relay_mean: float

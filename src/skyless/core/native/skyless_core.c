@@ -241,7 +241,7 @@ INTERNAL void open_range_error(State *s, int32_t anchor, real innovation);
 INTERNAL void adapt_change_noise(State *s, int32_t anchor, real normalised);
 INTERNAL real adapted(State *s, real scale, bool is_too_small, real least, real largest);
 INTERNAL bool is_off_zero(State *s, real mean);
-INTERNAL bool has_ended(State *s, int32_t anchor, real sign, real innovation, real innovation_variance);
+INTERNAL bool judge_end(State *s, int32_t anchor, real sign, real innovation, real innovation_variance);
 INTERNAL void note_innovation(State *s, real innovation, real innovation_variance, bool is_difference);
 INTERNAL bool is_within_gate(State *s, real normalised);
 INTERNAL real variance_scale(State *s, real normalised, bool is_difference);
@@ -2313,8 +2313,8 @@ INTERNAL real clear_variance(State *s, int32_t anchor) {
 /* Decay of an anchor's range errors over the time and the walked distance since its newest packet.
  *
  * Returns the kept share of the changing part, its long-term variance, and the kept share of the constant part. The
- * changing part is a Gauss–Markov process of walked distance and time. Where range errors jump, both parts are
- * forgotten within seconds; one that has jumped itself wanders and returns to zero. */
+ * changing part is a Gauss–Markov process of walked distance and time. Where range errors jump, a part of its variance
+ * and the constant part are forgotten within seconds; one that has jumped itself wanders and returns to zero. */
 INTERNAL range_error_decay_results range_error_decay(State *s, int32_t anchor, real dt, real walked_m) {
     real variance = 0;
     real kept = 0;
@@ -3258,14 +3258,16 @@ INTERNAL void open_range_error(State *s, int32_t anchor, real innovation) {
     make_uncertain(s, CHANGING_RANGE_ERRORS);
 }
 
-/* Adapt the process noise of an obstructed anchor's range error to an innovation.
+/* Adapt the process noise of an anchor's range error to an innovation, if it is obstructed.
  *
  * It becomes smaller soon: if it were large, the error's end would look like another change. */
 INTERNAL void adapt_change_noise(State *s, int32_t anchor, real normalised) {
     Anchor *a = &s->anchors[anchor];
-    a->change_mean += s->tuning.mean_gain * (normalised - a->change_mean);
-    a->change_scale *= is_off_zero(s, a->change_mean) ? s->tuning.noise_growth : REAL(1.0) - s->tuning.mean_gain;
-    a->change_scale = min_real(max_real(a->change_scale, REAL(1.0)), s->tuning.max_scale);
+    if (a->is_obstructed) {
+        a->change_mean += s->tuning.mean_gain * (normalised - a->change_mean);
+        a->change_scale *= is_off_zero(s, a->change_mean) ? s->tuning.noise_growth : REAL(1.0) - s->tuning.mean_gain;
+        a->change_scale = min_real(max_real(a->change_scale, REAL(1.0)), s->tuning.max_scale);
+    }
 }
 
 /* Factor on process noise after an innovation, which shows whether the noise is too small. */
@@ -3280,23 +3282,31 @@ INTERNAL bool is_off_zero(State *s, real mean) {
     return mean * mean * (REAL(2.0) - gain) / gain > square(s->tuning.suspect);
 }
 
-/* Whether measurements of an obstructed anchor are more likely without its range error, by their likelihoods.
+/* Sum the evidence of a measurement that an obstruction has ended, and return whether it has.
  *
- * The logarithms of the ratios are summed from the first one on that favours the end (CUSUM, Page 1954). P·h of the
- * newest measurement, which contains the range error with ``sign``, is the first of ``U``. */
-INTERNAL bool has_ended(State *s, int32_t anchor, real sign, real innovation, real innovation_variance) {
+ * Measurements are then more likely without the range error: the logarithms of the ratios are summed from the first
+ * one on that favours the end (CUSUM, Page 1954), each squared error up to the gate, as single packets are late. An
+ * error that returns slowly has ended once it is small, and known to be. P·h of the newest measurement, which contains
+ * the range error with ``sign``, is the first of ``U``. */
+INTERNAL bool judge_end(State *s, int32_t anchor, real sign, real innovation, real innovation_variance) {
     Anchor *a = &s->anchors[anchor];
     int32_t change = s->layout.change + anchor;
+    Tuning *tuning = &s->tuning;
+    real most = square(s->settings.gate);
     if (!a->is_obstructed) {
         return false;
     }
-    real left_m = innovation + sign * s->x[change];
-    real left_variance = innovation_variance - REAL(2.0) * sign * s->U[0][change] + s->P[at(change, change)];
-    left_variance = max_real(left_variance, s->settings.rx_variance_m2) + clear_variance(s, anchor);
-    real shown = square(innovation) / innovation_variance - square(left_m) / left_variance;
-    a->ended_log_odds += REAL(0.5) * (shown + log_(innovation_variance / left_variance));
-    a->ended_log_odds = max_real(a->ended_log_odds, REAL(0.0));
-    return a->ended_log_odds > s->tuning.ended_log_odds;
+    real error_m = s->x[change];
+    real variance = s->P[at(change, change)];
+    real left_variance = max_real(innovation_variance - REAL(2.0) * sign * s->U[0][change] + variance,
+            s->settings.rx_variance_m2);
+    left_variance += clear_variance(s, anchor);
+    real shown = min_real(square(innovation) / innovation_variance, most);
+    shown -= min_real(square(innovation + sign * error_m) / left_variance, most);
+    a->ended_log_odds = max_real(REAL(0.0), a->ended_log_odds + REAL(0.5) * (shown + log_(innovation_variance /
+            left_variance)));
+    real small = square(tuning->ended_std_m) + max_real(a->change_variance_m2, s->status.place_variance_m2);
+    return a->ended_log_odds > tuning->ended_log_odds || max_real(variance, square(error_m)) < small;
 }
 
 /* Count an innovation as rejected or accepted, and update the running means. */
@@ -3339,7 +3349,7 @@ INTERNAL real variance_scale(State *s, real normalised, bool is_difference) {
     if (is_difference) {
         return max_real(REAL(1.0), abs_real(normalised) / tuning->difference_huber);
     }
-    bool may_be_late = is_late_often(s) || jump_share(s) > REAL(0.5) * tuning->jump_rise;
+    bool may_be_late = is_late_often(s) || jump_share(s) > tuning->recent_jumps;
     return may_be_late ? max_real(REAL(1.0), abs_real(normalised) / tuning->reception_huber) : REAL(1.0);
 }
 
@@ -3952,7 +3962,7 @@ INTERNAL int32_t own_reception(State *s, int32_t anchor, int64_t rx_ticks, int64
     real innovation = (real)(rx_ticks - tx_ticks - a->offset_ticks) * TICK_M - expected_m;
     real innovation_variance = compute_ph(s) + rx_variance;
     a->range_m = range_m;
-    if (has_ended(s, anchor, REAL(1.0), innovation, innovation_variance)) {
+    if (judge_end(s, anchor, REAL(1.0), innovation, innovation_variance)) {
         innovation += end_obstruction(s, anchor);
         innovation_variance = compute_ph(s) + rx_variance;
     }
@@ -4000,9 +4010,7 @@ INTERNAL bool use_reception(State *s, int32_t anchor, real innovation, real inno
     real normalised = innovation / SQRT(innovation_variance);
     real scale = variance_scale(s, normalised, false);
     if (scale > REAL(0.0)) {
-        if (s->anchors[anchor].is_obstructed) {
-            adapt_change_noise(s, anchor, normalised);
-        }
+        adapt_change_noise(s, anchor, normalised);
         if (is_warm(s)) {
             adapt_process_noise(s, normalised / scale);
         }
@@ -4253,7 +4261,7 @@ INTERNAL void survey_pair(State *s, int32_t one, int32_t other) {
     int32_t survey = s->layout.survey + s->dim * misplaced;
     make_uncertain(s, ALL_RANGE_ERRORS);
     if (a->is_obstructed) {  /* what seemed to be an obstacle */
-        reset_state(s, s->layout.change + misplaced, a->change_variance_m2);
+        reset_state(s, s->layout.change + misplaced, clear_variance(s, misplaced));
         a->is_obstructed = false;
     }
     for (int32_t axis = 0, axis_end = s->dim; axis < axis_end; axis++) {
@@ -4379,7 +4387,7 @@ INTERNAL int32_t difference(State *s, int32_t a, int32_t b, int64_t rx_ticks, re
     real innovation_variance = compute_ph(s) + square(settings->difference_std_m);
     for (int32_t far = 0; far < 2; far++) {
         int32_t anchor = far == 1 ? b : a;
-        if (has_ended(s, anchor, REAL(2.0) * (real)far - REAL(1.0), innovation, innovation_variance)) {
+        if (judge_end(s, anchor, REAL(2.0) * (real)far - REAL(1.0), innovation, innovation_variance)) {
             innovation += end_obstruction(s, anchor);
             innovation_variance = compute_ph(s) + square(settings->difference_std_m);
         }
@@ -4398,6 +4406,8 @@ INTERNAL int32_t difference(State *s, int32_t a, int32_t b, int64_t rx_ticks, re
     update_later(s, innovation, innovation_variance * scale);
     finish_updates(s);
     bound_changes(s);
+    adapt_change_noise(s, a, -normalised);
+    adapt_change_noise(s, b, normalised);
     adapt_change_variance(s, a, a_elapsed_s);
     adapt_change_variance(s, b, b_elapsed_s);
     return USED;
@@ -7808,21 +7818,21 @@ SKYLESS_EXPORT void skyless_begin_tag(Tag *t, int32_t site, real qa, real lowest
             = REAL(0.005), .late_often_share = REAL(0.02), .reception_huber = REAL(1.5), .difference_huber = REAL(1.0),
             .max_relays_rejected = REAL(4.0), .lost_in_row = REAL(8.0), .lost_share = REAL(0.5), .suspect = REAL(3.0),
             .in_row = REAL(2.0), .in_row_where_late = REAL(5.0), .together = REAL(7.0), .first_change_scale =
-            REAL(20.0), .ended_log_odds = REAL(7.0), .obstructed_walk = REAL(0.004), .obstruction_memory_s = REAL(10.0),
-            .obstruction_return_m = REAL(0.2), .jump_rise = REAL(0.5), .obstructed_std_m = REAL(0.04), .obstructed_s =
-            REAL(5.0), .place_step_m = REAL(0.1), .place_first = REAL(20.0), .place_samples = REAL(100.0), .place_memory
-            = REAL(1000.0), .place_min_m2 = REAL(0.0012), .place_kept = REAL(0.1), .max_change_std_m = REAL(0.5),
-            .lasting_std_m = REAL(0.3), .recent_std_m = REAL(0.08), .creeping_std_m = REAL(0.2), .recent_packets =
-            REAL(16.0), .creeping_s = REAL(3.0), .late_std_m = REAL(1.0), .sure_chi2 = REAL(50.0), .early_weight =
-            REAL(0.8), .open_pair_std_m = REAL(0.1), .pair_relays = REAL(12.0), .misplaced_pairs = REAL(2.0),
-            .start_age_s = REAL(0.5), .curved_std = REAL(0.1), .start_patience_s = REAL(0.5), .start_tail =
-            REAL(0.0001), .new_start_s = REAL(1.0), .start_margin = REAL(4.0), .short_silence_s = REAL(0.1),
-            .longest_silence_s = REAL(5.0), .slow_superframe_s = REAL(0.2), .slow_curved_std = REAL(0.7),
-            .slow_start_std = REAL(2.0), .longest_superframe_s = REAL(1.3), .heights_in_row = REAL(20.0),
-            .open_survey_std_m = REAL(0.15), .fitting_chi2 = REAL(2.0), .most_late = REAL(2.0), .late_penalty =
-            REAL(2.0), .staying_share = REAL(0.2), .window = REAL(60.0), .window_s = REAL(1.0), .moving_window =
-            REAL(20.0), .moving_std_m = REAL(1.5), .moving_nis = REAL(1.5), .moving_apart = REAL(6.0),
-            .median_difference_std_m = REAL(0.08), .late_start_std_m = REAL(0.14), .rival_m = REAL(0.5),
+            REAL(20.0), .ended_log_odds = REAL(7.0), .ended_std_m = REAL(0.05), .obstructed_walk = REAL(0.004),
+            .obstruction_memory_s = REAL(10.0), .obstruction_return_m = REAL(0.2), .jump_rise = REAL(0.5), .recent_jumps
+            = REAL(0.25), .obstructed_std_m = REAL(0.04), .obstructed_s = REAL(5.0), .place_step_m = REAL(0.1),
+            .place_first = REAL(20.0), .place_samples = REAL(100.0), .place_memory = REAL(1000.0), .place_min_m2 =
+            REAL(0.0012), .place_kept = REAL(0.1), .max_change_std_m = REAL(0.5), .lasting_std_m = REAL(0.3),
+            .recent_std_m = REAL(0.08), .creeping_std_m = REAL(0.2), .recent_packets = REAL(16.0), .creeping_s =
+            REAL(3.0), .late_std_m = REAL(1.0), .sure_chi2 = REAL(50.0), .early_weight = REAL(0.8), .open_pair_std_m =
+            REAL(0.1), .pair_relays = REAL(12.0), .misplaced_pairs = REAL(2.0), .start_age_s = REAL(0.5), .curved_std =
+            REAL(0.1), .start_patience_s = REAL(0.5), .start_tail = REAL(0.0001), .new_start_s = REAL(1.0),
+            .start_margin = REAL(4.0), .short_silence_s = REAL(0.1), .longest_silence_s = REAL(5.0), .slow_superframe_s
+            = REAL(0.2), .slow_curved_std = REAL(0.7), .slow_start_std = REAL(2.0), .longest_superframe_s = REAL(1.3),
+            .heights_in_row = REAL(20.0), .open_survey_std_m = REAL(0.15), .fitting_chi2 = REAL(2.0), .most_late =
+            REAL(2.0), .late_penalty = REAL(2.0), .staying_share = REAL(0.2), .window = REAL(60.0), .window_s =
+            REAL(1.0), .moving_window = REAL(20.0), .moving_std_m = REAL(1.5), .moving_nis = REAL(1.5), .moving_apart =
+            REAL(6.0), .median_difference_std_m = REAL(0.08), .late_start_std_m = REAL(0.14), .rival_m = REAL(0.5),
             .height_margin_m = REAL(1.0), .neighbourhood = REAL(1.5), .most_horizontal_std_m = REAL(3.0),
             .zero_variance_m2 = REAL(10000.0), .phase_start_std_m = REAL(0.002), .phase_max_std_m = REAL(0.006),
             .phase_mesh_std_m = REAL(0.0012), .phase_wander = REAL(25.0), .phase_gate = REAL(0.35), .phase_share =

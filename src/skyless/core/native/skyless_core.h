@@ -681,7 +681,7 @@ typedef struct Tuning {
     real noise_growth;  /* Growth of adapted process noise with each innovation that requires more … */
     /* Largest factor on the random walk of a clock; for the tag's, at once when all innovations are on one side. */
     real max_walk_scale;
-    real noise_loss;  /* … and its factor with every other innovation. */
+    real noise_loss;  /* … and its factor with every other innovation; that of a range error has 1 − ``mean_gain``. */
     /* If the normalised innovations of all anchors are beyond this on one side, the tag's clock has left its rate. */
     real common;
     /* Time over which rates of clocks are compared, while phases are in use, to learn how little they wander [s] … */
@@ -763,11 +763,13 @@ typedef struct Tuning {
     real together;  /* Sum of two such normalised innovations, reached by chance once in some million packets. */
     /* Factor on the process noise of a range error that has just jumped, as it may still be changing. */
     real first_change_scale;
-    real ended_log_odds;  /* Logarithm of the odds for no range error at which an obstruction has ended. */
+    real ended_log_odds;  /* Sum of logarithms of odds for no range error at which an obstruction has ended … */
+    real ended_std_m;  /* … as it has once the range error is smaller than this, and known to it [m]. */
     real obstructed_walk;  /* Spectral density of the random walk of a range error that has jumped [m²/s]. */
     real obstruction_memory_s;  /* Time constant of its return to zero, and of forgetting a jump [s]. */
     real obstruction_return_m;  /* Largest return in that time [m]: long delays are no less likely to stay. */
     real jump_rise;  /* Fraction of its full size by which a jump raises the process noise of all range errors. */
+    real recent_jumps;  /* Fraction from which on the next jump is expected, and large innovations are down-weighted. */
     real obstructed_std_m;  /* Standard deviation by which all range errors change after jumps [m] … */
     real obstructed_s;  /* … and the time constant of that change [s]. */
     real place_step_m;  /* Length of a step [m]. */
@@ -1147,7 +1149,7 @@ typedef struct Anchor {
     bool is_obstructed;  /* Whether its range error has jumped and not returned. */
     real change_mean;  /* Running mean of its normalised innovations since then. */
     real change_scale;  /* Factor on the process noise of a range error that has jumped. */
-    real ended_log_odds;  /* Logarithm of the odds that it has returned to zero. */
+    real ended_log_odds;  /* Sum of the logarithms of odds that it has returned to zero, since they began to show it. */
     bool has_fault;  /* Whether a lasting fault of it has been added to the state. */
     real relay_mean;  /* Running mean of its clock's normalised innovations in relays. */
     real walk_scale;  /* Factor on its oscillator's random walk. */
