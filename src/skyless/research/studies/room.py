@@ -252,8 +252,8 @@ def _fields(plan: Plan) -> list[Case]:
 
 def _obstacles(plan: Plan) -> list[Case]:
     lab = lab_site(plan.noise_ps)
-    wall = (Limit("rmse_m", most=0.08), Limit("nees", most=3.0), _exceeded(1e-3))
-    body = (Limit("rmse_m", most=0.12), Limit("nees", most=4.0), _exceeded(1e-3))
+    wall = (Limit("rmse_m", most=0.05), Limit("nees", most=3.0), _exceeded(1e-3))
+    body = (Limit("rmse_m", most=0.09), Limit("nees", most=3.0), _exceeded(1e-3))
     past = partial(past_wall, plan.tags)
     walled = replace(lab, walls=(WALL,))
     return [
