@@ -123,13 +123,20 @@ def test_an_obstruction_ends_where_measurements_are_more_likely_without_its_erro
     assert not monitor.judge_end(s, 1, sign, innovation, with_it), "there is none"
 
 
-def test_an_obstruction_ends_once_its_error_is_small_and_known():
-    s = state()
-    change, limit = s.layout.change + 1, TUNING.ended_std_m**2 + s.anchors[1].change_variance_m2
-    s.anchors[1].is_obstructed, s.U[0][change] = True, 0.0
-    for error_m2, variance, is_over in ((1.0 - HAIR, 1.0 - HAIR, True), (1.1, 0.5, False), (0.5, 1.1, False)):
-        s.x[change], s.P[at(change, change)] = -math.sqrt(error_m2 * limit), variance * limit
-        assert monitor.judge_end(s, 1, 1.0, 0.0, 1e-3) is is_over
+def test_an_obstruction_ends_as_it_is_once_its_error_is_known_and_close_to_zero():
+    s, usual = state(), 0.0001
+    a, change, known = s.anchors[1], s.layout.change + 1, TUNING.ended_std_m**2 + usual
+    s.status.place_variance_m2, s.U[0][change] = usual, 0.0
+    for share, sigmas, is_over in (
+        (1.0 - HAIR, 0.0, True),
+        (1.0 + HAIR, 0.0, False),
+        (0.5, 1.0 - HAIR, True),
+        (0.5, 1.0 + HAIR, False),
+    ):
+        s.P[at(change, change)], a.is_obstructed = share * known, True
+        s.x[change] = error_m = -sigmas * math.sqrt(share * known + usual)
+        assert not monitor.judge_end(s, 1, 1.0, 0.0, 1e-3), "nothing is reset"
+        assert (a.is_obstructed, s.x[change]) == (not is_over, error_m)
 
 
 # The clocks

@@ -118,12 +118,12 @@ def _is_off_zero(s: State, mean: float) -> bool:
 
 
 def judge_end(s: State, anchor: int, sign: float, innovation: float, innovation_variance: float) -> bool:
-    """Sum the evidence of a measurement that an obstruction has ended, and return whether it has.
+    """Sum the evidence of a measurement that an obstruction has ended, and return whether its error must be reset.
 
     Measurements are then more likely without the range error: the logarithms of the ratios are summed from the first
     one on that favours the end (CUSUM, Page 1954), each squared error up to the gate, as single packets are late. An
-    error that returns slowly has ended once it is small, and known to be. P·h of the newest measurement, which contains
-    the range error with ``sign``, is the first of ``U``.
+    error that returns slowly ends as it is, once it is known and close to zero. P·h of the newest measurement, which
+    contains the range error with ``sign``, is the first of ``U``.
     """
     a, change, tuning, most = s.anchors[anchor], s.layout.change + anchor, s.tuning, square(s.settings.gate)
     if not a.is_obstructed:
@@ -134,8 +134,9 @@ def judge_end(s: State, anchor: int, sign: float, innovation: float, innovation_
     shown = min(square(innovation) / innovation_variance, most)
     shown -= min(square(innovation + sign * error_m) / left_variance, most)
     a.ended_log_odds = max(0.0, a.ended_log_odds + 0.5 * (shown + log(innovation_variance / left_variance)))
-    small = square(tuning.ended_std_m) + max(a.change_variance_m2, s.status.place_variance_m2)
-    return a.ended_log_odds > tuning.ended_log_odds or max(variance, square(error_m)) < small
+    usual = s.status.place_variance_m2
+    a.is_obstructed = variance >= square(tuning.ended_std_m) + usual or square(error_m) >= variance + usual
+    return a.is_obstructed and a.ended_log_odds > tuning.ended_log_odds
 
 
 def note_innovation(s: State, innovation: float, innovation_variance: float, is_difference: bool) -> None:

@@ -160,7 +160,7 @@ class Tuning(Record):
     ended_log_odds: float = 7.0
     """Sum of logarithms of odds for no range error at which an obstruction has ended …"""
     ended_std_m: float = 0.05
-    """… as it has once the range error is smaller than this, and known to it [m]."""
+    """… as it has once the range error is known to this, and within its standard deviation of zero [m]."""
     obstructed_walk: float = 0.004
     """Spectral density of the random walk of a range error that has jumped [m²/s]."""
     obstruction_memory_s: float = 10.0

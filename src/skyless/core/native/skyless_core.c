@@ -3282,12 +3282,12 @@ INTERNAL bool is_off_zero(State *s, real mean) {
     return mean * mean * (REAL(2.0) - gain) / gain > square(s->tuning.suspect);
 }
 
-/* Sum the evidence of a measurement that an obstruction has ended, and return whether it has.
+/* Sum the evidence of a measurement that an obstruction has ended, and return whether its error must be reset.
  *
  * Measurements are then more likely without the range error: the logarithms of the ratios are summed from the first
  * one on that favours the end (CUSUM, Page 1954), each squared error up to the gate, as single packets are late. An
- * error that returns slowly has ended once it is small, and known to be. P·h of the newest measurement, which contains
- * the range error with ``sign``, is the first of ``U``. */
+ * error that returns slowly ends as it is, once it is known and close to zero. P·h of the newest measurement, which
+ * contains the range error with ``sign``, is the first of ``U``. */
 INTERNAL bool judge_end(State *s, int32_t anchor, real sign, real innovation, real innovation_variance) {
     Anchor *a = &s->anchors[anchor];
     int32_t change = s->layout.change + anchor;
@@ -3305,8 +3305,9 @@ INTERNAL bool judge_end(State *s, int32_t anchor, real sign, real innovation, re
     shown -= min_real(square(innovation + sign * error_m) / left_variance, most);
     a->ended_log_odds = max_real(REAL(0.0), a->ended_log_odds + REAL(0.5) * (shown + log_(innovation_variance /
             left_variance)));
-    real small = square(tuning->ended_std_m) + max_real(a->change_variance_m2, s->status.place_variance_m2);
-    return a->ended_log_odds > tuning->ended_log_odds || max_real(variance, square(error_m)) < small;
+    real usual = s->status.place_variance_m2;
+    a->is_obstructed = variance >= square(tuning->ended_std_m) + usual || square(error_m) >= variance + usual;
+    return a->is_obstructed && a->ended_log_odds > tuning->ended_log_odds;
 }
 
 /* Count an innovation as rejected or accepted, and update the running means. */

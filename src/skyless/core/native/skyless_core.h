@@ -764,7 +764,8 @@ typedef struct Tuning {
     /* Factor on the process noise of a range error that has just jumped, as it may still be changing. */
     real first_change_scale;
     real ended_log_odds;  /* Sum of logarithms of odds for no range error at which an obstruction has ended … */
-    real ended_std_m;  /* … as it has once the range error is smaller than this, and known to it [m]. */
+    /* … as it has once the range error is known to this, and within its standard deviation of zero [m]. */
+    real ended_std_m;
     real obstructed_walk;  /* Spectral density of the random walk of a range error that has jumped [m²/s]. */
     real obstruction_memory_s;  /* Time constant of its return to zero, and of forgetting a jump [s]. */
     real obstruction_return_m;  /* Largest return in that time [m]: long delays are no less likely to stay. */
