@@ -17,13 +17,12 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import numpy as np
-import pyarrow as pa
 
 from skyless.core.errors import SkylessError
 from skyless.run.history.answers import Span
 from skyless.run.history.layout import EVENT_COLUMNS, FIX_COLUMNS, NAME_COLUMNS, ZONE_COLUMNS, file_name, site_folder
 from skyless.run.history.queries import History
-from skyless.run.history.tables import schema_of, write_table
+from skyless.run.history.tables import columns_of, write_table
 
 SITE, TAGS, HOUR_S = 1, 500, 3600
 HALL_M = np.array([100.0, 60.0])
@@ -31,13 +30,6 @@ BEGIN = datetime(2026, 11, 2, tzinfo=UTC)
 ZONES = 24
 SHIFT_S = 8 * HOUR_S
 ERROR_OF_TAGS = "SELECT tag, avg(std_m) AS std_m FROM fixes GROUP BY tag"
-
-
-def table_of(columns, data):
-    schema = schema_of(columns)
-    as_numbers = {field.name: pa.int64() if pa.types.is_timestamp(field.type) else field.type for field in schema}
-    arrays = [pa.array(data[field.name], as_numbers[field.name]).cast(field.type) for field in schema]
-    return pa.Table.from_arrays(arrays, schema=schema)
 
 
 def write_history(folder, rows):
@@ -62,7 +54,7 @@ def write_history(folder, rows):
             "hpl_cm": draw.integers(20, 50, count), "flags": np.full(count, 16),
         }  # fmt: skip
         file = site / f"day={begin.date()}" / file_name(first, first + count - 1)
-        write_table(table_of(FIX_COLUMNS, columns), file)
+        write_table(columns, FIX_COLUMNS, file)
         first, size = first + count, size + file.stat().st_size
         strip = (way[:, ::30, 0] / HALL_M[0] * ZONES).astype(int).clip(0, ZONES - 1)  # zones are strips of the hall
         before = strip if last is None else np.column_stack([last, strip])
@@ -76,19 +68,19 @@ def write_history(folder, rows):
 
 def write_events(site, events):
     events.sort()
-    ms, kinds, tags, zones = zip(*events, strict=True)
-    none = [None] * len(events)
-    columns = {
-        "t": ms, "kind": kinds, "tag": [f"tag{tag + 1}" for tag in tags], "zone": [f"zone{zone}" for zone in zones],
-        "subject": none, "alarm": none, "text": [""] * len(events),
-    }  # fmt: skip
-    write_table(table_of(EVENT_COLUMNS, columns), site / "events" / f"day={BEGIN.date()}" / file_name(1, len(events)))
-    names = {"tag": range(1, TAGS + 1), "name": [f"tag{k}" for k in range(1, TAGS + 1)], "since": [0] * TAGS}
-    write_table(table_of(NAME_COLUMNS, names), site / "names.parquet")
-    zones = [f"zone{k}" for k in range(ZONES)]
-    write_table(
-        table_of(ZONE_COLUMNS, {"zone": zones, "name": zones, "corners_m": ["[]"] * ZONES}), site / "zones.parquet"
-    )
+    rows = [
+        dict.fromkeys(EVENT_COLUMNS)
+        | {"t": ms, "kind": kind, "tag": f"tag{tag + 1}", "zone": f"zone{zone}", "text": ""}
+        for ms, kind, tag, zone in events
+    ]
+    write(rows, EVENT_COLUMNS, site / "events" / f"day={BEGIN.date()}" / file_name(1, len(events)))
+    write([{"tag": k, "name": f"tag{k}", "since": 0} for k in range(1, TAGS + 1)], NAME_COLUMNS, site / "names.parquet")
+    zones = [{"zone": f"zone{k}", "name": f"zone{k}", "corners_m": "[]"} for k in range(ZONES)]
+    write(zones, ZONE_COLUMNS, site / "zones.parquet")
+
+
+def write(rows, kinds, file):
+    write_table(columns_of(rows, kinds), kinds, file)
 
 
 def answer(folder, name, rows):

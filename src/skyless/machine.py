@@ -19,7 +19,6 @@ EXTRA_OF: Final = {
     "nats": "gather",
     "pandas": "pandas",
     "prometheus_client": "prometheus",
-    "pyarrow": "history",
     "pyocd": "flash",
     "rosbags": "ros2",
     "scipy": "site",

@@ -6,27 +6,23 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 import numpy as np
-import pyarrow as pa
 import pytest
 from pyarrow import parquet
 
 from skyless.cli.main import main
 from skyless.run.history import layout
+from support.parquet_files import arrow_table
 
 pytestmark = pytest.mark.site
 
 BEGIN = datetime(2026, 11, 20, 8, tzinfo=UTC).timestamp()
 RANGE = ("--from", str(BEGIN), "--to", str(BEGIN + 3600.0))
 DOCUMENT = (Path(__file__).parents[2] / "docs" / "history.md").read_text(encoding="utf-8")
-TYPES = {"timestamp[ms, tz=UTC]": pa.timestamp("ms", tz="UTC")}
 
 
 def write(file, columns, rows):
     file.parent.mkdir(parents=True, exist_ok=True)
-    arrays = {}
-    for (name, kind), values in zip(columns.items(), zip(*rows, strict=True), strict=True):
-        arrays[name] = pa.array(values, pa.int64()).cast(TYPES[kind]) if kind in TYPES else pa.array(values, kind)
-    parquet.write_table(pa.table(arrays), file)
+    parquet.write_table(arrow_table(columns, dict(zip(columns, zip(*rows, strict=True), strict=True))), file)
 
 
 @pytest.fixture(scope="module")

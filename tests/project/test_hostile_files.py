@@ -10,7 +10,7 @@ from skyless.core.errors import SkylessError
 from skyless.run.history.answers import Span
 from skyless.run.history.layout import EVENT_COLUMNS, FIX_COLUMNS, NAME_COLUMNS, file_name, site_folder
 from skyless.run.history.queries import History
-from skyless.run.history.tables import schema_of
+from support.parquet_files import ARROW_TYPES, arrow_table
 
 pytestmark = pytest.mark.site
 
@@ -44,14 +44,13 @@ def column(kind, draw):
 def test_a_history_of_extreme_values_answers_or_says_why_not(tmp_path, seed):
     draw, site = np.random.default_rng(seed), site_folder(tmp_path, 1)
     for folder, columns in ((site, FIX_COLUMNS), (site / "events", EVENT_COLUMNS)):
-        schema = schema_of(columns)
         (folder / "day=2024-10-04").mkdir(parents=True)
-        table = pa.Table.from_arrays([column(field.type, draw) for field in schema], schema=schema)
+        table = pa.table({name: column(ARROW_TYPES[kind], draw) for name, kind in columns.items()})
         if columns is FIX_COLUMNS and seed > 3:
             table = table.drop_columns(["flags"]) if seed > 4 else table.set_column(2, "x_mm", pa.array(["a"] * 50))
         parquet.write_table(table, folder / "day=2024-10-04" / file_name(1, 50))
-    names = pa.Table.from_arrays([pa.array([1]), pa.array(["a"]), pa.array([0])], names=list(NAME_COLUMNS))
-    parquet.write_table(names.cast(schema_of(NAME_COLUMNS | {"since": "int64"})), site / "names.parquet")
+    names = arrow_table(NAME_COLUMNS, {"tag": [1], "name": ["a"], "since": [0]})
+    parquet.write_table(names, site / "names.parquet")
     zones = pa.table({"zone": ["z", None], "name": [None, "n"], "corners_m": ["[[[[", None]})
     parquet.write_table(zones, site / "zones.parquet")
     for span in (Span(0.0, 2e9), Span(1.728e9 - 10.0, 1.728e9 + 1e6)):

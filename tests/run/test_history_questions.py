@@ -27,6 +27,7 @@ from skyless.run.history.layout import (
 )
 from skyless.run.history.queries import History, sites_in
 from skyless.run.web import HistoryLimits
+from support.parquet_files import arrow_table
 
 pytestmark = pytest.mark.site
 
@@ -61,13 +62,6 @@ ALARMS = [
 ]
 
 
-def table(columns, data):
-    types = {"timestamp[ms, tz=UTC]": pa.timestamp("ms", tz="UTC")}
-    kinds = {name: types.get(kind) or pa.type_for_alias(kind) for name, kind in columns.items()}
-    return pa.table({name: pa.array(data[name], pa.int64()).cast(kind) if kind in types.values() else
-                     pa.array(data[name], kind) for name, kind in kinds.items()})  # fmt: skip
-
-
 def made_rows(seed=1):
     """Fixes of walkers in a room, by the order of arrival, with silences and two tags that walk together."""
     draw = np.random.default_rng(seed)
@@ -91,29 +85,29 @@ def write_fixes(site, rows, first, last):
     day = datetime.fromtimestamp(part["t"][0] / 1000, UTC).date()
     folder = site / f"day={day}"
     folder.mkdir(parents=True, exist_ok=True)
-    fixes = table(FIX_COLUMNS, {name: values[order] for name, values in part.items()})
+    fixes = arrow_table(FIX_COLUMNS, {name: values[order] for name, values in part.items()})
     parquet.write_table(fixes, folder / file_name(first, last), row_group_size=7000)
 
 
 def write_others(site):
     names = [*((k, f"tag{k}", 0) for k in range(1, TAGS)), (TAGS, "old", 0), (TAGS, "renamed", 5)]
-    parquet.write_table(table(NAME_COLUMNS, dict(zip(NAME_COLUMNS, zip(*names, strict=True), strict=True))),
+    parquet.write_table(arrow_table(NAME_COLUMNS, dict(zip(NAME_COLUMNS, zip(*names, strict=True), strict=True))),
                         site / "names.parquet")  # fmt: skip
     assets = {"tag": ["tag3", "tag4", "tag5", "tag6", "tag7", "gone"],
               "name": ["Forklift", "Twin", "Twin", "tag3", "", "Forklift"]}  # fmt: skip
-    parquet.write_table(table(ASSET_COLUMNS, assets), site / "assets.parquet")
+    parquet.write_table(arrow_table(ASSET_COLUMNS, assets), site / "assets.parquet")
     zones = {
         "zone": ["a", "b", "empty"],
         "name": ["Hall", "", "Void"],
         "corners_m": ["[[0, 0], [4, 0], [4, 4]]", None, "[]"],
     }
-    parquet.write_table(table(ZONE_COLUMNS, zones), site / "zones.parquet")
+    parquet.write_table(arrow_table(ZONE_COLUMNS, zones), site / "zones.parquet")
     rows = [(round(1000 * (BEGIN + s)), kind, tag, zone, None, None, "") for s, kind, tag, zone in EVENTS]
     rows += [(round(1000 * (BEGIN + s)), kind, None, None, about, one, text) for s, kind, one, about, text in ALARMS]
     folder = site / "events" / "day=2026-11-20"
     folder.mkdir(parents=True)
     for first, part in ((1, rows[:9]), (10, rows[9:])):
-        events = table(EVENT_COLUMNS, dict(zip(EVENT_COLUMNS, zip(*sorted(part), strict=True), strict=True)))
+        events = arrow_table(EVENT_COLUMNS, dict(zip(EVENT_COLUMNS, zip(*sorted(part), strict=True), strict=True)))
         parquet.write_table(events, folder / file_name(first, first + len(part) - 1))
 
 
@@ -230,7 +224,7 @@ def test_a_wild_fix_makes_no_grid_of_a_billion_cells(tmp_path, rows):
     wild = {name: values.copy() for name, values in rows.items()}
     wild["x_mm"][50_000], wild["y_mm"][50_010] = 2_000_000_000, -2_000_000_000
     write_fixes(site, wild, 1, len(rows["t"]))
-    parquet.write_table(table(NAME_COLUMNS, {"tag": [1], "name": ["tag1"], "since": [0]}), site / "names.parquet")
+    parquet.write_table(arrow_table(NAME_COLUMNS, {"tag": [1], "name": ["tag1"], "since": [0]}), site / "names.parquet")
     history, span = History(tmp_path, 1), Span(BEGIN, BEGIN + 5000.0)
     assert len(history.contacts("tag1", span)) > 0
     heatmap = history.heatmap(span, 0.25)
@@ -294,7 +288,7 @@ def test_a_damaged_file_is_named_and_no_traceback(tmp_path, rows, spoilt):
     """Empty, cut off, half, and a sound file whose middle was overwritten."""
     site = site_folder(tmp_path, 1)
     write_fixes(site, {name: values[:2000] for name, values in rows.items()}, 1, 2000)
-    parquet.write_table(table(NAME_COLUMNS, {"tag": [1], "name": ["tag1"], "since": [0]}), site / "names.parquet")
+    parquet.write_table(arrow_table(NAME_COLUMNS, {"tag": [1], "name": ["tag1"], "since": [0]}), site / "names.parquet")
     (file,) = site.glob("day=*/*.parquet")
     data = file.read_bytes()
     file.write_bytes(
@@ -391,7 +385,7 @@ def test_days_that_are_thinned(tmp_path):
     (file,) = site.glob("day=*/*.parquet")
     parquet.write_table(parquet.ParquetFile(file).read().replace_schema_metadata({b"skyless_thinned": b"yes"}), file)
     names = {"tag": [1, 2, 3], "name": ["rest", "near", "moving"], "since": [0, 0, 0]}
-    parquet.write_table(table(NAME_COLUMNS, names), site / "names.parquet")
+    parquet.write_table(arrow_table(NAME_COLUMNS, names), site / "names.parquet")
     history, span = History(tmp_path, 2), Span(MIDNIGHT, MIDNIGHT + 3600.0)
     assert sum(history.heatmap(span, tags=("rest",)).seconds) == pytest.approx(59 * 60.0)
     assert history.track("moving", span).length_m == pytest.approx(0.5 * (6 * minutes - 1))

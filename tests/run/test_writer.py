@@ -7,6 +7,7 @@ import random
 from datetime import UTC, datetime
 from pathlib import Path
 
+import pyarrow as pa
 import pytest
 from made_fixes import DAY_S, NOON_S, fix, in_files, records
 from pyarrow import parquet
@@ -15,9 +16,10 @@ from skyless.core.errors import SkylessError
 from skyless.run.fix_batch import records_of
 from skyless.run.history import writer as writer_module
 from skyless.run.history.layout import FIX_COLUMNS, Place, current_events, current_files, rows_of, site_folder
-from skyless.run.history.tables import Event, fix_table
+from skyless.run.history.tables import Event, fix_columns, write_table
 from skyless.run.history.writer import Writer
 from skyless.run.web import HistoryLimits
+from support.parquet_files import ARROW_TYPES
 
 
 class Killed(BaseException):
@@ -200,13 +202,17 @@ def test_too_many_tags_are_counted(tmp_path, monkeypatch):
     writer.close()
 
 
-def test_the_columns_are_those_of_the_layout_and_sorted():
+def test_the_columns_are_those_of_the_layout_and_sorted(tmp_path):
     found = [(2, fix("b", unix_s=5.0)), (1, fix("a", unix_s=9.0)), (2, fix("b", unix_s=4.0, hpl_m=0.5))]
-    table = fix_table(records_of(found, simulated=True))
-    kinds = {field.name: str(field.type) for field in table.schema}
-    assert kinds == FIX_COLUMNS
+    write_table(
+        fix_columns(records_of(found, simulated=True)), FIX_COLUMNS, tmp_path / "fixes.parquet", {"key": "it's"}
+    )
+    table = parquet.read_table(tmp_path / "fixes.parquet")
+    assert table.schema.metadata[b"key"] == b"it's"
+    kinds = {field.name: field.type for field in table.schema}
+    assert kinds == {name: ARROW_TYPES[kind] for name, kind in FIX_COLUMNS.items()} | {"t": pa.timestamp("us", "UTC")}
     assert table["tag"].to_pylist() == [1, 2, 2]
-    assert table["t"].cast("int64").to_pylist() == [9000, 4000, 5000]
+    assert table["t"].cast("int64").to_pylist() == [9_000_000, 4_000_000, 5_000_000]
     assert table["hpl_cm"].to_pylist() == [65535, 50, 65535]
     assert table.select(["x_mm", "y_mm", "z_mm"]).to_pylist()[0] == {"x_mm": 1000, "y_mm": 2000, "z_mm": 3000}
 
@@ -217,5 +223,5 @@ def test_the_standard_deviation_is_that_of_the_message(variances, height_known):
     if height_known:
         variances = (*variances[:2], 0.0)
     message = fix(variances=variances, height_known=height_known)
-    table = fix_table(records_of([(1, message)], simulated=False))
-    assert table["std_mm"][0].as_py() == pytest.approx(min(1000.0 * message.std_m, 65535.0), abs=1.0)
+    table = fix_columns(records_of([(1, message)], simulated=False))
+    assert table["std_mm"][0] == pytest.approx(min(1000.0 * message.std_m, 65535.0), abs=1.0)

@@ -87,7 +87,7 @@ def broker(*, asked: BrokerOptions, gathered: GatherOptions, output: JsonOptions
         asked.leave_out("hub", why="it belongs to --gather")
         gathered.leave_out("site_id", "keep_gb", why="it belongs to --gather")
     if (history := asked.history) is not None:
-        extra_module("pyarrow", "--history")
+        extra_module("duckdb", "--history")
         make_folder("--history", history)
         if asked.certificate is not None:
             raise SkylessError(

@@ -345,8 +345,8 @@ class WholeSite:
             raise SkylessError(f"--boards is {asked.boards}; it should be 0 at a site with a master: boards know none")
         self.history = asked.history
         if asked.history is not None:
-            extra_module("pyarrow", "--history")
-        elif self._has_story and find_spec("pyarrow") and find_spec("duckdb"):
+            extra_module("duckdb", "--history")
+        elif self._has_story and find_spec("duckdb"):
             self.history = Path(self._ports.name, "history")
         if self.history is not None:
             make_folder("--history", self.history)  # the page asks it before the history's first file

@@ -16,27 +16,29 @@ from typing import Final, Literal
 
 from msgspec import Struct
 
+TIME: Final = "TIMESTAMPTZ"
+
 FIX_COLUMNS: Final = {
-    "tag": "uint32",
-    "t": "timestamp[ms, tz=UTC]",
-    "x_mm": "int32",
-    "y_mm": "int32",
-    "z_mm": "int32",
-    "std_mm": "uint16",
-    "hpl_cm": "uint16",
-    "flags": "uint16",
+    "tag": "UINTEGER",
+    "t": TIME,
+    "x_mm": "INTEGER",
+    "y_mm": "INTEGER",
+    "z_mm": "INTEGER",
+    "std_mm": "USMALLINT",
+    "hpl_cm": "USMALLINT",
+    "flags": "USMALLINT",
 }
-"""Sorted by tag and t. ``std_mm`` is the one-sigma radial error; ``hpl_cm`` is 65535 for no level; ``flags`` are those
-of a record of a batch (``run/fix_batch.py``)."""
+"""Kinds are DuckDB's. Sorted by tag and t. ``std_mm`` is the one-sigma radial error; ``hpl_cm`` is 65535 for no level;
+``flags`` are those of a record of a batch (``run/fix_batch.py``)."""
 
 EVENT_COLUMNS: Final = {
-    "t": "timestamp[ms, tz=UTC]",
-    "kind": "string",
-    "tag": "string",
-    "zone": "string",
-    "subject": "string",
-    "alarm": "string",
-    "text": "string",
+    "t": TIME,
+    "kind": "VARCHAR",
+    "tag": "VARCHAR",
+    "zone": "VARCHAR",
+    "subject": "VARCHAR",
+    "alarm": "VARCHAR",
+    "text": "VARCHAR",
 }
 """``kind`` is an ``EventKind``. ``tag`` is the tag's name and ``zone`` the zone's identifier, null if there is none;
 ``subject`` is ``anchor-<id>`` or what an alarm is about; ``alarm`` is the alarm's id; ``text`` is for people, and names
@@ -44,14 +46,14 @@ the person who acknowledged an alarm."""
 
 EventKind = Literal["enter", "leave", "alarm-raised", "alarm-ended", "alarm-acknowledged", "offline", "online"]
 
-NAME_COLUMNS: Final = {"tag": "uint32", "name": "string", "since": "timestamp[ms, tz=UTC]"}
-ASSET_COLUMNS: Final = {"tag": "string", "name": "string"}
-ZONE_COLUMNS: Final = {"zone": "string", "name": "string", "corners_m": "string"}
+NAME_COLUMNS: Final = {"tag": "UINTEGER", "name": "VARCHAR", "since": TIME}
+ASSET_COLUMNS: Final = {"tag": "VARCHAR", "name": "VARCHAR"}
+ZONE_COLUMNS: Final = {"zone": "VARCHAR", "name": "VARCHAR", "corners_m": "VARCHAR"}
 """``corners_m`` is a list of pairs in JSON."""
 
-THINNED: Final = b"skyless_thinned"
+THINNED: Final = "skyless_thinned"
 """Metadata key of files with thinned fixes: one every ten seconds or every minute."""
-PLACE: Final = b"skyless_place"
+PLACE: Final = "skyless_place"
 """Metadata key of the place in the site's stream (``Place``, JSON) up to which this file and those before are complete.
 """
 

@@ -15,8 +15,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, cast
 
 import numpy as np
-import pyarrow as pa
-import pyarrow.compute as pc
 from msgspec import Struct
 from msgspec.structs import replace
 from nats.errors import Error
@@ -30,7 +28,7 @@ from skyless.run.gather.node import Gather
 from skyless.run.gather.streams import Names, follow, make_streams
 from skyless.run.gather.subjects import NatsAddress, connect, rarely
 from skyless.run.history.layout import FIX_COLUMNS, Place, current_events, current_files, day_of, sites_in
-from skyless.run.history.tables import REMEMBERED_KINDS, Event, EventLog, read_events, read_table, unix_ms
+from skyless.run.history.tables import REMEMBERED, Event, EventLog, read_columns, read_events, unix_ms
 from skyless.run.history.writer import FILE_ROWS, Intake, Keep, Writer, tidy
 from skyless.run.hub import LIST_S, sites_at
 from skyless.run.mqtt.address import MqttAddress
@@ -181,8 +179,7 @@ class SiteHistory:
         """Raises SkylessError if the past events cannot be read."""
         self._writer, self._keep, self._log, self._say = writer, keep, log, rarely(log)
         self._trouble: dict[str, str] = {}
-        remembered = pc.field("kind").isin(REMEMBERED_KINDS)
-        log_of_events = EventLog(read_events(current_events(writer.root, writer.site), remembered))
+        log_of_events = EventLog(read_events(current_events(writer.root, writer.site), REMEMBERED))
         self._started_s = time.monotonic()
         self._feed = SiteFeed(time.time)
         take_messages(self._feed, writer, log_of_events, writer.events.add)
@@ -581,14 +578,14 @@ def _known(recording: McapRecording, writer: Writer) -> tuple[NDArray[np.int64],
         return np.empty(0, np.int64), lambda _: False
     begin = datetime.fromtimestamp(summary.start_s, UTC) - _MARGIN
     end = datetime.fromtimestamp(summary.end_s, UTC) + _MARGIN
-    span = (pc.field("t") >= begin) & (pc.field("t") <= end)
+    span = f"t BETWEEN '{begin.isoformat()}' AND '{end.isoformat()}'"
     days = str(begin.date()), str(end.date())
     files = [file for file in current_files(writer.root, writer.site) if days[0] <= day_of(file) <= days[1]]
     columns = {name: FIX_COLUMNS[name] for name in ("tag", "t")}
-    tables = [read_table(file, columns, span) for file in files]
-    keys = [_keys(table["tag"].to_numpy(), table["t"].cast(pa.int64()).to_numpy()) for table in tables]
-    remembered = span | pc.field("kind").isin(REMEMBERED_KINDS)  # the broker keeps these, perhaps from long before
-    events = set(read_events(current_events(writer.root, writer.site), remembered))
+    tables = [read_columns(file, columns, span) for file in files]
+    keys = [_keys(table["tag"], table["t"]) for table in tables]
+    wanted = f"{span} OR {REMEMBERED}"  # the broker keeps what is remembered, perhaps from long before
+    events = set(read_events(current_events(writer.root, writer.site), wanted))
     ends = defaultdict[Event, list[datetime]](list)
     for event in events:
         if event.kind == "offline":

@@ -1,13 +1,10 @@
 """Queries on the history of a site: tracks, times in cells and zones, contacts, and SQL.
 
-DuckDB reads the files, or PyArrow where a query needs all rows. Rows that are in no file yet, from the last ten minutes
-or so, are not included.
+DuckDB reads the files. Rows that are in no file yet, from the last ten minutes or so, are not included.
 """
 
 import contextlib
 import math
-import secrets
-import tempfile
 from array import array
 from collections import defaultdict
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
@@ -20,9 +17,7 @@ from typing import Any, Final, ParamSpec, TypeVar
 import duckdb
 import msgspec
 import numpy as np
-import pyarrow
 from numpy.typing import NDArray
-from pyarrow import parquet
 
 from skyless.arguments import check_number
 from skyless.core.errors import SkylessError
@@ -42,10 +37,10 @@ from skyless.run.history.layout import (
     site_folder,
     sites_in,
 )
-from skyless.run.history.tables import ROW_GROUP, read_table, schema_of
+from skyless.run.history.tables import ROW_GROUP, connection, database, metadata_in, quoted, read_rows, select
 from skyless.run.web import HISTORY as LIMITS
 
-# Times in cells and contacts need all rows: PyArrow and NumPy take a third of DuckDB's processor time here.
+# Times in cells and contacts need all rows: NumPy takes a third of DuckDB's processor time here.
 
 _SIDE: Final = 2000
 """Cells along each side of the grid, which is centred on the first fixes. Not a power of two: rows would then share few
@@ -68,7 +63,7 @@ def time_in_cells(files: Sequence[Path], span: Span, cell_mm: int, tags: Collect
     """First and last fix of each tag in each batch. Rows: tag, time, longest time that the fix may count (0 for a first
     one), cell."""
     corner: list[int] = []
-    for (tag, t, x, y), gap_ms in read_rows(files, span, tags):
+    for (tag, t, x, y), gap_ms in fixes_in(files, span, tags):
         places = x // cell_mm, y // cell_mm
         corner = corner or [int(np.median(one)) - _SIDE // 2 for one in places]
         column, row = ((one - first).view(np.uint32) for one, first in zip(places, corner, strict=True))
@@ -108,7 +103,7 @@ def near(
     in a bucket is compared. ``gap`` is the largest number of buckets between those of one contact. Raises OSError.
     """
     firsts: list[tuple[_ScanInts, ...]] = []
-    for (_, t, x, y), _ in read_rows(files, span, own):
+    for (_, t, x, y), _ in fixes_in(files, span, own):
         nth = np.unique(t // bucket_ms, return_index=True)[1]
         firsts.append((t[nth], x[nth], y[nth]))
     if not firsts:
@@ -119,7 +114,7 @@ def near(
     buckets, nth = np.unique(times[order] // bucket_ms, return_index=True)
     x0, y0 = (column[order[nth]].astype(np.int64) for column in places)
     runs: list[NDArray[np.int64]] = []
-    for (tag, t, x, y), _ in read_rows(files, span, None):
+    for (tag, t, x, y), _ in fixes_in(files, span, None):
         bucket = t // bucket_ms
         at = np.searchsorted(buckets, bucket).clip(max=len(buckets) - 1)
         rows = np.flatnonzero((np.abs(x - x0[at]) <= distance_mm) & (buckets[at] == bucket))
@@ -152,46 +147,25 @@ def joined(parts: Sequence[NDArray[np.int64]], gap: int) -> NDArray[np.int64]:
     )
 
 
-def read_rows(files: Sequence[Path], span: Span, tags: Collection[int] | None) -> Iterator[tuple[list[_ScanInts], int]]:
+def fixes_in(files: Sequence[Path], span: Span, tags: Collection[int] | None) -> Iterator[tuple[list[_ScanInts], int]]:
     """Yield batches of fixes (tags, times in ms, x and y in mm), each with the longest time in ms that a fix counts."""
     begin_ms, end_ms = (math.ceil(round(1000.0 * unix_s, 2)) for unix_s in (span.from_unix_s, span.to_unix_s))
-    wanted = schema_of({name: FIX_COLUMNS[name] for name in ("tag", "t", "x_mm", "y_mm")})
-    for file in files:
-        try:
-            whole = parquet.ParquetFile(file, memory_map=True, pre_buffer=False)
-            if not {*wanted} <= {*whole.schema_arrow} or len({*whole.schema_arrow.names}) < len(whole.schema_arrow):
-                raise ValueError(f"its columns are {', '.join(whole.schema_arrow.names)}")
-        except ValueError as error:  # includes ArrowInvalid
-            raise SkylessError(f"{file} cannot be read; it should be a Parquet file of fixes: {error}") from None
-        gap_ms = round(1000.0 * (THINNED_GAP_S if THINNED in (whole.schema_arrow.metadata or {}) else GAP_S))
-        for group in range(whole.num_row_groups):
-            (tag0, tag1), (first_ms, last_ms) = (limits(whole.metadata, group, name) for name in ("tag", "t"))
-            if last_ms < begin_ms or first_ms >= end_ms or not (tags is None or any(tag0 <= n <= tag1 for n in tags)):
-                continue
-            for batch in whole.iter_batches(ROW_GROUP, [group], wanted.names, use_threads=False):
-                tag, t, x, y = (batch[name] for name in wanted.names)
-                rows = [np.from_dlpack(column) for column in (tag, t.view("int64"), x, y)]
-                if tags is not None:
-                    rows = [column[np.isin(rows[0], list(tags))] for column in rows]
-                if first_ms < begin_ms or last_ms >= end_ms:
-                    rows = [column[(rows[1] >= begin_ms) & (rows[1] < end_ms)] for column in rows]
-                if len(rows[0]):
-                    yield rows, gap_ms
-
-
-def limits(metadata: parquet.FileMetaData, group: int, column: str) -> tuple[int, int]:
-    """Smallest and largest value of a column in a row group; times are in ms. Raises ValueError."""
-    known = metadata.row_group(group).column(metadata.schema.names.index(column)).statistics
-    if known is None or not isinstance(known.max_raw, int):
-        raise ValueError(f"its column {column} has no whole numbers, or no statistics of them")
-    return known.min_raw, known.max_raw  # min and max would be dates, and import Pandas
+    kinds = {name: FIX_COLUMNS[name] for name in ("tag", "t", "x_mm", "y_mm")}
+    wanted = f"t >= make_timestamptz({1000 * begin_ms}) AND t < make_timestamptz({1000 * end_ms})"
+    wanted += f" AND {_KNOWN}" + ("" if tags is None else f" AND tag IN ({', '.join(map(str, tags))})")
+    with connection() as duck:
+        for file, metadata in metadata_in(duck, files).items():
+            gap_ms = round(1000.0 * (THINNED_GAP_S if THINNED in metadata else GAP_S))
+            columns = [*select(duck, [file], kinds, wanted).fetchnumpy().values()]
+            for first in range(0, len(columns[0]), ROW_GROUP):  # in parts, which needs less memory
+                yield [column[first : first + ROW_GROUP] for column in columns], gap_ms
 
 
 _EARLY: Final = timedelta(hours=1)
 _LATE: Final = timedelta(days=1)
 """How much earlier or later than its own time a fix may arrive: clocks differ, and sites buffer while disconnected."""
 
-_UNREADABLE: Final = (OSError, ValueError, RecursionError, duckdb.Error, pyarrow.ArrowException, msgspec.MsgspecError)
+_UNREADABLE: Final = (OSError, ValueError, RecursionError, duckdb.Error, msgspec.MsgspecError)
 _OF_SQL: Final = (
     *(duckdb.ParserException, duckdb.BinderException, duckdb.CatalogException),
     *(duckdb.PermissionException, duckdb.DataError),
@@ -215,10 +189,12 @@ _FIX_VALUES: Final = f"""
     flags & {SIMULATED} != 0 AS simulated
 """
 
+_KNOWN: Final = "tag NOT NULL AND x_mm NOT NULL AND y_mm NOT NULL"
+
 _FIXES: Final = f"""
     SELECT tag, epoch_ms(t) AS ms, {_FIX_VALUES}
     FROM read_parquet($files) WHERE t >= to_timestamp($begin) AND t < to_timestamp($end)
-        AND x_mm NOT NULL AND y_mm NOT NULL AND z_mm NOT NULL AND std_mm NOT NULL
+        AND z_mm NOT NULL AND std_mm NOT NULL AND {_KNOWN}
 """
 
 _DWELL: Final = """
@@ -276,11 +252,14 @@ def _asked(question: Callable[_P, _R]) -> Callable[_P, _R]:
 def _damaged(history: object) -> Path | None:
     """Return the first unreadable file of a history: not every error names it."""
     if isinstance(history, History):
-        for file in (*current_files(history.folder, history.site), *current_events(history.folder, history.site)):
+        kinds = dict.fromkeys(current_files(history.folder, history.site), FIX_COLUMNS)
+        kinds |= dict.fromkeys(current_events(history.folder, history.site), EVENT_COLUMNS)
+        for file, columns in kinds.items():
             try:
-                whole = parquet.ParquetFile(file)
-                for group in range(whole.num_row_groups):
-                    _ = limits(whole.metadata, group, "t"), whole.read_row_group(group)
+                with connection() as duck:
+                    found = select(duck, [file], columns)
+                    while found.fetchmany(10_000):
+                        pass
             except _UNREADABLE:
                 return file
     return None
@@ -322,9 +301,11 @@ class History:
         """Return the time of the newest row in a file; None if there is none."""
         files = (*current_files(self.folder, self.site), *current_events(self.folder, self.site))
         last_day = max(map(day_of, files), default="")
-        newest = [parquet.read_metadata(file) for file in files if day_of(file) == last_day]
-        times = [limits(one, group, "t")[1] for one in newest for group in range(one.num_row_groups)]
-        return max(times) / 1000 if times else None
+        newest = [file for file in files if day_of(file) == last_day]
+        sql = "SELECT epoch_ms(max(t)) FROM read_parquet($file)"  # answered from the files' statistics
+        with connection() as duck:
+            found = [row for file in newest for row in duck.execute(sql, {"file": str(file)}).fetchall()]
+        return max((ms / 1000 for (ms,) in found if ms is not None), default=None)
 
     # Queries
 
@@ -422,7 +403,7 @@ class History:
         if file.suffix not in {".csv", ".parquet"}:
             raise SkylessError(f"{file} ends with {file.suffix!r}; it should end with .csv or .parquet")
         with whole_file(file) as scratch, self._views(query, span, scratch) as (duck, select):
-            copy = f"COPY (\n{select}\n) TO {_quoted(scratch)} (FORMAT {file.suffix[1:]})"
+            copy = f"COPY (\n{select}\n) TO {quoted(scratch)} (FORMAT {file.suffix[1:]})"
             return int(duck.execute(copy).fetchall()[0][0])
 
     @contextlib.contextmanager
@@ -434,20 +415,21 @@ class History:
             file = self._site_folder / f"{name}.parquet"
             tables[name] = columns, [file] if file.exists() else []
         readable = [file.resolve() for _, files in tables.values() for file in files]
-        with _connection() as duck:
+        with database() as duck:
             for name, (columns, files) in tables.items():
                 if files:
-                    listed = ", ".join(_quoted(file.resolve()) for file in files)
+                    listed = ", ".join(quoted(file.resolve()) for file in files)
                     duck.execute(f"CREATE VIEW {name} AS SELECT {', '.join(columns)} FROM read_parquet([{listed}])")
                 else:
-                    duck.register(name, schema_of(columns).empty_table())
+                    nothing = ", ".join(f"CAST(NULL AS {kind}) AS {column}" for column, kind in columns.items())
+                    duck.execute(f"CREATE VIEW {name} AS SELECT {nothing} LIMIT 0")
             names = self._names()
             duck.execute(
                 "CREATE TABLE names AS SELECT unnest($1::BIGINT[]) AS number, unnest($2::VARCHAR[]) AS name",
                 [list(names), list(names.values())],
             )
             duck.execute(VIEWS.format(begin=span.from_unix_s, end=span.to_unix_s))
-            allowed = ", ".join(map(_quoted, (*readable, *written)))
+            allowed = ", ".join(map(quoted, (*readable, *written)))
             duck.execute(f"SET allowed_paths = [{allowed}]; SET enable_external_access = false")
             duck.execute("SET lock_configuration = true")
             try:
@@ -467,12 +449,12 @@ class History:
 
     def _table(self, name: str, columns: dict[str, str]) -> list[dict[str, Any]]:
         file = self._site_folder / name
-        rows = read_table(file, columns).to_pylist() if file.exists() else []
+        rows = read_rows(file, columns) if file.exists() else []
         return [row for row in rows if row[next(iter(columns))] is not None]
 
     def _names(self) -> dict[int, str]:
         """Newest name of each number."""
-        rows = self._table("names.parquet", NAME_COLUMNS | {"since": "int64"})
+        rows = self._table("names.parquet", NAME_COLUMNS)
         return {row["tag"]: row["name"] for row in sorted(rows, key=lambda row: row["since"] or 0) if row["name"]}
 
     def _tags(self, asked: Iterable[str]) -> dict[str, list[int]]:
@@ -534,30 +516,14 @@ class _Way:
 # Files and DuckDB
 
 
-@contextlib.contextmanager
-def _connection() -> Iterator[duckdb.DuckDBPyConnection]:
-    """Open DuckDB with temporary files only, and without the network."""
-    spill = str(Path(tempfile.gettempdir()) / f"skyless-history-{secrets.token_hex(8)}")  # created only if needed
-    options: dict[str, Any] = {"memory_limit": f"{LIMITS.memory_mb}MB", "temp_directory": spill}
-    # One thread takes less processor time in total, and leaves the other cores to the site.
-    options |= {"autoinstall_known_extensions": "false", "python_enable_replacements": "false", "threads": 1}
-    with duckdb.connect(config=options) as duck:
-        yield duck
-
-
 def _stream(sql: str, files: Iterable[Path], span: Span, **more: object) -> Iterator[tuple[Any, ...]]:
     """Yield the rows of a result, with few of them in memory at once."""
     parameters = {"files": list(map(str, files)), "begin": span.from_unix_s, "end": span.to_unix_s} | more
     if parameters["files"]:
-        with _connection() as duck:
+        with connection() as duck:
             found = duck.execute(sql, parameters)
             while rows := found.fetchmany(10_000):
                 yield from rows
-
-
-def _quoted(path: Path) -> str:
-    """A path as a text in SQL."""
-    return "'" + str(path).replace("'", "''") + "'"
 
 
 def _day(unix_s: float, later: timedelta) -> str:
@@ -581,7 +547,8 @@ def _of_days(files: Iterable[Path], span: Span) -> list[Path]:
 
 
 def _are_thinned(files: Iterable[Path]) -> bool:
-    return any(THINNED in (parquet.read_schema(file).metadata or {}) for file in files)
+    with connection() as duck:
+        return any(THINNED in metadata for metadata in metadata_in(duck, files).values())
 
 
 def _some(known: Iterable[str], kind: str) -> str:

@@ -1,28 +1,34 @@
-"""Tables of a history's rows, and reading and writing of whole files."""
+"""Tables of a history's rows, and reading and writing of whole Parquet files by DuckDB.
+
+In memory a table is its columns by name. Times are whole milliseconds since 1970, and None among texts is null.
+"""
 
 import contextlib
+import errno
 import os
-from collections.abc import Iterable, Iterator, Sequence
+import secrets
+import tempfile
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from datetime import UTC, datetime
+from functools import cache
 from pathlib import Path
 from typing import Any, Final
 
+import duckdb
 import msgspec
 import numpy as np
-import pyarrow as pa
-import pyarrow.compute as pc
 from msgspec import Struct
 from numpy.typing import NDArray
-from pyarrow import parquet
 
 from skyless.core.errors import SkylessError
 from skyless.run.fix_batch import NONE_U16, Records
-from skyless.run.history.layout import EVENT_COLUMNS, FIX_COLUMNS, PLACE, EventKind, Place
+from skyless.run.history.layout import EVENT_COLUMNS, PLACE, THINNED, TIME, EventKind, Place
 from skyless.run.mqtt.messages import AlarmMessage, StatusMessage, ZoneEvent
 from skyless.run.web import HISTORY as LIMITS
 
 ROW_GROUP: Final = 131_072
-_TIME: Final = pa.timestamp("ms", tz="UTC")
+
+Columns = dict[str, NDArray[Any]]
 
 
 class Event(Struct, frozen=True):
@@ -37,15 +43,8 @@ class Event(Struct, frozen=True):
     text: str = ""
 
 
-def schema_of(columns: dict[str, str]) -> pa.Schema:
-    """Arrow schema of columns that ``layout.py`` defines."""
-    return pa.schema(
-        [(name, _TIME if kind.startswith("timestamp") else pa.type_for_alias(kind)) for name, kind in columns.items()]
-    )
-
-
-def fix_table(records: Records) -> pa.Table:
-    """Convert records (``run/fix_batch.py``) to a table sorted by tag and time.
+def fix_columns(records: Records) -> Columns:
+    """Convert records (``run/fix_batch.py``) to columns sorted by tag and time.
 
     ``std_mm`` is the root of the covariance's trace, as ``FixMessage.std_m``; the correlation of x and y is dropped.
     """
@@ -53,12 +52,10 @@ def fix_table(records: Records) -> pa.Table:
     up_mm = np.where(rows["std_z_mm"] == NONE_U16, 0, rows["std_z_mm"]).astype(np.float64)
     plane_m2 = rows["covariance_m2"][:, [0, 2]].astype(np.float64).clip(0.0).sum(axis=1)
     std_mm = np.nan_to_num(np.rint(np.sqrt(1e6 * plane_m2 + up_mm**2)), nan=NONE_U16)
-    columns: dict[str, NDArray[Any]] = {name: rows[name] for name in ("tag", "hpl_cm", "flags")}
-    columns |= {"t": unix_ms(rows), "std_mm": std_mm.clip(0, NONE_U16).astype(np.uint16)}
+    columns: Columns = {"tag": rows["tag"], "t": unix_ms(rows)}
     columns |= dict(zip(("x_mm", "y_mm", "z_mm"), rows["position_mm"].T, strict=True))
-    schema = schema_of(FIX_COLUMNS)
-    arrays = [pa.array(np.ascontiguousarray(columns[field.name])).cast(field.type) for field in schema]
-    return pa.Table.from_arrays(arrays, schema=schema)
+    columns |= {"std_mm": std_mm.clip(0, NONE_U16).astype(np.uint16), "hpl_cm": rows["hpl_cm"], "flags": rows["flags"]}
+    return {name: np.ascontiguousarray(column) for name, column in columns.items()}
 
 
 def unix_ms(records: Records) -> NDArray[np.int64]:
@@ -66,75 +63,159 @@ def unix_ms(records: Records) -> NDArray[np.int64]:
     return (records["unix_us"] // np.uint64(1000)).astype(np.int64)
 
 
-def event_table(events: Sequence[Event]) -> pa.Table:
-    """Convert events to a table sorted by time."""
+def event_columns(events: Sequence[Event]) -> Columns:
+    """Convert events to columns sorted by time."""
     rows = [msgspec.structs.asdict(event) for event in sorted(events, key=lambda event: event.t)]
-    return pa.Table.from_pylist(rows, schema_of(EVENT_COLUMNS))
+    return columns_of([row | {"t": round(1000 * row["t"].timestamp())} for row in rows], EVENT_COLUMNS)
 
 
-def read_table(file: Path, columns: dict[str, str], wanted: pc.Expression | None = None) -> pa.Table:
+def columns_of(rows: Sequence[Mapping[str, object]], kinds: Mapping[str, str]) -> Columns:
+    """Convert rows to columns of the kinds of ``layout.py``."""
+    return {
+        name: np.array([row[name] for row in rows], object if kind == "VARCHAR" else np.int64)
+        for name, kind in kinds.items()
+    }
+
+
+def database() -> duckdb.DuckDBPyConnection:
+    """Open DuckDB with temporary files only, and without the network."""
+    spill = str(Path(tempfile.gettempdir()) / f"skyless-history-{secrets.token_hex(8)}")  # created only if needed
+    options: dict[str, Any] = {"memory_limit": f"{LIMITS.memory_mb}MB", "temp_directory": spill}
+    # One thread takes less processor time in total, and leaves the other cores to the site.
+    options |= {"autoinstall_known_extensions": "false", "python_enable_replacements": "false", "threads": 1}
+    return duckdb.connect(config=options)
+
+
+_shared_database = cache(database)
+"""One for the process, as opening one takes 15 ms."""
+
+
+def connection() -> duckdb.DuckDBPyConnection:
+    """Connect to this process's database, for one thread; it should be closed."""
+    return _shared_database().cursor()
+
+
+def select(
+    duck: duckdb.DuckDBPyConnection, files: Iterable[Path], kinds: Mapping[str, str], wanted: str = "true"
+) -> duckdb.DuckDBPyConnection:
+    """Ask for columns of the rows of files for which the SQL ``wanted`` is true. Raises duckdb.Error."""
+    values = ", ".join(
+        f"epoch_us({name}) // 1000 AS {name}" if kind == TIME else f"CAST({name} AS {kind}) AS {name}"
+        for name, kind in kinds.items()
+    )
+    sql = f"SELECT {values} FROM read_parquet($files, hive_partitioning = false) WHERE {wanted}"
+    return duck.execute(sql, {"files": list(map(str, files))})
+
+
+def metadata_in(duck: duckdb.DuckDBPyConnection, files: Iterable[Path]) -> dict[Path, dict[str, str]]:
+    """Return the metadata of files that a history has written there. Raises duckdb.Error."""
+    found: dict[Path, dict[str, str]] = {file: {} for file in files}
+    sql = f"""SELECT file_name, decode(key), decode(value) FROM parquet_kv_metadata($files)
+        WHERE key IN ('{PLACE}'::BLOB, '{THINNED}'::BLOB)"""
+    for file, key, value in duck.execute(sql, {"files": list(map(str, found))}).fetchall() if found else ():
+        found[Path(file)][key] = value
+    return found
+
+
+@contextlib.contextmanager
+def _reading(file: Path, what: str = "") -> Iterator[duckdb.DuckDBPyConnection]:
+    """Open DuckDB for reading a file. Raises SkylessError if it cannot be read."""
+    try:
+        with connection() as duck:
+            yield duck
+    except duckdb.Error as error:
+        reason = str(error).partition("\n")[0]
+        raise SkylessError(f"{file} cannot be read; it should be a Parquet file{what}: {reason}") from None
+
+
+def read_columns(file: Path, kinds: Mapping[str, str], wanted: str = "true") -> Columns:
     """Read columns of the wanted rows of a file. Raises SkylessError if it cannot be read or lacks a column."""
-    try:
-        table = parquet.ParquetFile(file).read(columns=list(columns)).cast(schema_of(columns))
-        table.validate(full=True)  # among others, that texts are UTF-8
-    except (OSError, ValueError, pa.ArrowException) as error:
-        should = f"it should be a Parquet file with {', '.join(columns)}"
-        raise SkylessError(f"{file} cannot be read; {should}: {error}") from None
-    return table if wanted is None else table.filter(wanted)
+    with _reading(file, f" with {', '.join(kinds)}") as duck:
+        return select(duck, [file], kinds, wanted).fetchnumpy()
 
 
-def metadata_of(file: Path) -> dict[bytes, bytes]:
+def read_rows(file: Path, kinds: Mapping[str, str], wanted: str = "true") -> list[dict[str, Any]]:
+    """Read the wanted rows of a file. Raises SkylessError if it cannot be read or lacks a column."""
+    with _reading(file, f" with {', '.join(kinds)}") as duck:
+        return [dict(zip(kinds, row, strict=True)) for row in select(duck, [file], kinds, wanted).fetchall()]
+
+
+def metadata_of(file: Path) -> dict[str, str]:
     """Return the metadata of a file. Raises SkylessError if it cannot be read."""
-    try:
-        return dict(parquet.read_schema(file).metadata or {})
-    except (OSError, ValueError, pa.ArrowException) as error:
-        raise SkylessError(f"{file} cannot be read; it should be a Parquet file: {error}") from None
+    with _reading(file) as duck:
+        return metadata_in(duck, [file])[file]
 
 
 def place_in(file: Path) -> Place:
     """Return the place in the stream up to which a history is complete with this file. Raises SkylessError."""
     try:
-        return msgspec.json.decode(metadata_of(file).get(PLACE, b"{}"), type=Place)
+        return msgspec.json.decode(metadata_of(file).get(PLACE, "{}"), type=Place)
     except msgspec.MsgspecError as error:
-        raise SkylessError(f"{file} has wrong metadata {PLACE.decode()}: {error}") from None
+        raise SkylessError(f"{file} has wrong metadata {PLACE}: {error}") from None
 
 
-def read_events(files: Iterable[Path], wanted: pc.Expression) -> Iterator[Event]:
+def read_events(files: Iterable[Path], wanted: str) -> Iterator[Event]:
     """Yield the wanted events in files, in order. Raises SkylessError."""
+    written = f"t BETWEEN to_timestamp(0) AND to_timestamp({LIMITS.last_unix_s})"  # no other times are kept
     for file in files:
-        yield from (Event(**row) for row in read_table(file, EVENT_COLUMNS, wanted).to_pylist())
+        for row in read_rows(file, EVENT_COLUMNS, f"{written} AND ({wanted})"):
+            yield Event(**row | {"t": datetime.fromtimestamp(row["t"] / 1000, UTC)})
 
 
-def write_table(table: pa.Table, file: Path) -> None:
-    """Write a file atomically and durably. Raises OSError.
+def quoted(text: Path | str) -> str:
+    """A path or a text in SQL."""
+    return "'" + str(text).replace("'", "''") + "'"
+
+
+def write_table(
+    table: Columns, kinds: Mapping[str, str], file: Path, metadata: Mapping[str, str] | None = None
+) -> None:
+    """Write columns of the kinds of ``layout.py`` to a file, atomically and durably. Raises OSError."""
+    values = ", ".join(
+        f"make_timestamptz(1000 * {name}) AS {name}" if kind == TIME else f"CAST({name} AS {kind}) AS {name}"
+        for name, kind in kinds.items()
+    )
+    with connection() as duck:
+        duck.register("rows", table)
+        write_answer(duck, f"SELECT {values} FROM rows", file, metadata)
+
+
+def write_answer(
+    duck: duckdb.DuckDBPyConnection, query: str, file: Path, metadata: Mapping[str, str] | None = None
+) -> None:
+    """Write the answer of a query to a file, atomically and durably. Raises OSError.
 
     A program that is killed meanwhile leaves a file of the same name with ``.tmp``.
     """
     file.parent.mkdir(parents=True, exist_ok=True)
     scratch = file.with_name(f"{file.name}.tmp")
-    texts = [field.name for field in table.schema if pa.types.is_string(field.type)]
-    numbers = [name for name in table.column_names if name not in texts]
-    options: dict[str, Any] = {"use_dictionary": texts, "compression": "lz4", "row_group_size": ROW_GROUP}
-    options["column_encoding"] = dict.fromkeys(numbers, "DELTA_BINARY_PACKED")
+    options = f"FORMAT parquet, COMPRESSION zstd, PARQUET_VERSION V2, ROW_GROUP_SIZE {ROW_GROUP}"
+    if metadata:
+        options += f", KV_METADATA {{{', '.join(f'{key}: {quoted(text)}' for key, text in metadata.items())}}}"
     try:
-        with scratch.open("wb") as out:
-            parquet.write_table(table, out, **options)
-            out.flush()
-            os.fsync(out.fileno())
+        duck.execute(f"COPY ({query}) TO {quoted(scratch)} ({options})")
+        _sync(scratch)
         scratch.replace(file)
-    except BaseException:
+    except BaseException as error:
         with contextlib.suppress(OSError):
             scratch.unlink()
+        if isinstance(error, duckdb.Error):
+            raise OSError(errno.EIO, str(error).partition("\n")[0], str(file)) from None
         raise
-    handle = os.open(file.parent, os.O_RDONLY)  # make the file's name durable, too
+    _sync(file.parent)  # makes the file's name durable, too
+
+
+def _sync(path: Path) -> None:
+    """Make a file or a folder durable."""
+    handle = os.open(path, os.O_RDONLY)
     try:
         os.fsync(handle)
     finally:
         os.close(handle)
 
 
-REMEMBERED_KINDS: Final = ("alarm-raised", "alarm-ended", "alarm-acknowledged", "offline", "online")
-"""Events derived from retained messages, for which the past ones must be known."""
+REMEMBERED: Final = "kind IN ('alarm-raised', 'alarm-ended', 'alarm-acknowledged', 'offline', 'online')"
+"""Events derived from retained messages, for which the past ones must be known, in SQL."""
 
 
 class EventLog:

@@ -10,7 +10,7 @@ import math
 import os
 import shutil
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from datetime import UTC, date, datetime
 from itertools import chain, groupby
 from pathlib import Path
@@ -19,10 +19,7 @@ from typing import Any, Final, Literal
 
 import msgspec
 import numpy as np
-import pyarrow as pa
 from msgspec import Struct
-from numpy.typing import NDArray
-from pyarrow import parquet
 
 from skyless.core.errors import SkylessError
 from skyless.run.fix_batch import Records
@@ -42,13 +39,17 @@ from skyless.run.history.layout import (
     site_folder,
 )
 from skyless.run.history.tables import (
+    Columns,
     Event,
-    event_table,
-    fix_table,
+    columns_of,
+    connection,
+    event_columns,
+    fix_columns,
     metadata_of,
     place_in,
-    read_table,
-    schema_of,
+    quoted,
+    read_rows,
+    write_answer,
     write_table,
 )
 from skyless.run.mqtt.messages import Asset, FixMessage, Zone
@@ -66,11 +67,14 @@ _ROOM_BYTES: Final = 1_000_000
 class Intake:
     """Rows of one kind, waiting for a file. ``write`` may be called from another thread than ``add``."""
 
-    def __init__(self, folder: Path, table: Callable[[Sequence[Any]], pa.Table]) -> None:
-        """``table`` makes a table of batches of rows. Raises SkylessError if the newest file cannot be read."""
+    def __init__(self, folder: Path, kinds: Mapping[str, str], table: Callable[[Sequence[Any]], Columns]) -> None:
+        """``table`` makes columns of ``kinds`` of batches of rows.
+
+        Raises SkylessError if the newest file cannot be read.
+        """
         self.taken = 0
         """Rows taken since the start."""
-        self._folder, self._table = folder, table
+        self._folder, self._kinds, self._table = folder, kinds, table
         self._batches: list[tuple[Records | Sequence[Event], float, Place]] = []
         files = largest_files(folder)
         first = self.last = (rows_of(files[-1]) or (0, 0))[1] if files else 0
@@ -100,8 +104,8 @@ class Intake:
         while batches > 0:
             day, rows, place = self._next_file(batches)
             last = self.last + sum(map(len, rows))
-            table = self._table(rows).replace_schema_metadata({PLACE: msgspec.json.encode(place)})
-            write_table(table, self._folder / f"day={day}" / file_name(self.last + 1, last))
+            file = self._folder / f"day={day}" / file_name(self.last + 1, last)
+            write_table(self._table(rows), self._kinds, file, {PLACE: msgspec.json.encode(place).decode()})
             self.last = last
             del self._batches[: len(rows)]
             batches -= len(rows)
@@ -127,7 +131,7 @@ class Table:
         """Rows by the value of the column ``key``."""
         self._file, self._columns, self._key, self._is_saved = file, columns, key, True
         if file.exists():
-            self.rows = {row[key]: row for row in read_table(file, columns).to_pylist()}
+            self.rows = {row[key]: row for row in read_rows(file, columns)}
 
     def set(self, *values: object) -> None:
         """Add or replace a row; the values are in the order of the columns."""
@@ -141,7 +145,7 @@ class Table:
         if not self._is_saved:
             self._is_saved = True  # before the rows are read: one that is set meanwhile is written the next time
             try:
-                write_table(pa.Table.from_pylist([*self.rows.values()], schema_of(self._columns)), self._file)
+                write_table(columns_of([*self.rows.values()], self._columns), self._columns, self._file)
             except BaseException:
                 self._is_saved = False
                 raise
@@ -169,8 +173,10 @@ class Writer:
             self.names = Table(names, NAME_COLUMNS, "name")
             self.assets = Table(self.folder / "assets.parquet", ASSET_COLUMNS, "tag")
             self.zones = Table(self.folder / "zones.parquet", ZONE_COLUMNS, "zone")
-            self.fixes = Intake(self.folder, lambda batches: fix_table(np.concatenate(batches)))
-            self.events = Intake(self.folder / "events", lambda batches: event_table([*chain.from_iterable(batches)]))
+            self.fixes = Intake(self.folder, FIX_COLUMNS, lambda batches: fix_columns(np.concatenate(batches)))
+            self.events = Intake(
+                self.folder / "events", EVENT_COLUMNS, lambda batches: event_columns([*chain.from_iterable(batches)])
+            )
         except BlockingIOError:
             raise SkylessError(f"{self.folder} is written by another program; each needs a folder of its own") from None
         except OSError as error:
@@ -210,7 +216,7 @@ class Writer:
                 self.drops["too-many-tags"] += 1
                 return None
             newest = next(reversed(self.names.rows.values()), {"tag": 0})
-            self.names.set(newest["tag"] + 1, name, datetime.fromtimestamp(unix_s, UTC))
+            self.names.set(newest["tag"] + 1, name, round(1000 * unix_s))
         return int(self.names.rows[name]["tag"])
 
     def set_zones(self, zones: Iterable[Zone]) -> None:
@@ -254,10 +260,16 @@ class Writer:
 JOINED_ROWS: Final = 2_000_000
 """Rows of a joined file: it must fit into memory several times."""
 
-_MOVING_MS: Final = 10_000
-_REST_MS: Final = 60_000
-_REST_MM: Final = 500
-"""A tag is at rest in a minute in which no coordinate changes by more than this."""
+THINNING: Final = """
+    SELECT {columns} FROM ({rows})
+    WINDOW minute AS (PARTITION BY tag, epoch_ms(t) // 60000),
+        up_to_now AS (PARTITION BY tag, epoch_ms(t) // 60000 ORDER BY t),
+        step AS (PARTITION BY tag, epoch_ms(t) // 10000 ORDER BY t)
+    QUALIFY row_number() OVER up_to_now = 1 OR (row_number() OVER step = 1 AND greatest(
+        max(x_mm) OVER minute - min(x_mm) OVER minute, max(y_mm) OVER minute - min(y_mm) OVER minute,
+        max(z_mm) OVER minute - min(z_mm) OVER minute) > 500)
+"""
+"""One fix per ten seconds of a moving tag, one per minute of one at rest: no coordinate changes by more than 0.5 m."""
 
 
 class Keep(Struct, frozen=True):
@@ -279,6 +291,7 @@ def tidy(root: Path, site: int, keep: Keep, unix_s: float) -> None:
 def _tidy(
     folder: Path, columns: dict[str, str], order: Sequence[str], days: float, full_days: float, unix_s: float
 ) -> None:
+    names, order_by = ", ".join(columns), ", ".join(order)
     current = largest_files(folder)
     newest = current[-1] if current else None
     _remove(file for file in folder.glob("day=*/*.parquet") if rows_of(file) and file not in current)
@@ -286,21 +299,25 @@ def _tidy(
         age_days = (datetime.fromtimestamp(unix_s, UTC).date() - date.fromisoformat(day)).days
         if age_days > days:
             _remove(file for file in of_day if file != newest)
-            if newest and day == day_of(newest) and parquet.read_metadata(newest).num_rows:  # it has the place
-                empty = schema_of(columns).empty_table().replace_schema_metadata(metadata_of(newest))
-                write_table(empty, newest)
+            if newest and day == day_of(newest):  # it has the place
+                with connection() as duck:
+                    write_answer(duck, f"SELECT {names} FROM {_rows_in([newest])} LIMIT 0", newest, metadata_of(newest))
             continue
         for files, first, last in _groups(of_day) if age_days > 0 else ():
             is_thinned = age_days <= full_days or all(THINNED in metadata_of(file) for file in files)
             if is_thinned and len(files) == 1:
                 continue
-            table = pa.concat_tables([read_table(file, columns) for file in files])
-            table = table.sort_by([(name, "ascending") for name in order])
-            joined, metadata = files[0].with_name(file_name(first, last)), metadata_of(files[-1])
+            select, metadata = f"SELECT {names} FROM {_rows_in(files)}", metadata_of(files[-1])
             if age_days > full_days:
-                table, metadata = thinned(table), metadata | {THINNED: b"yes"}
-            write_table(table.replace_schema_metadata(metadata), joined)
+                select, metadata = THINNING.format(columns=names, rows=select), metadata | {THINNED: "yes"}
+            joined = files[0].with_name(file_name(first, last))
+            with connection() as duck:
+                write_answer(duck, f"{select} ORDER BY {order_by}", joined, metadata)
             _remove(file for file in files if file != joined)
+
+
+def _rows_in(files: Iterable[Path]) -> str:
+    return f"read_parquet([{', '.join(map(quoted, files))}], hive_partitioning = false)"
 
 
 def _groups(files: Iterable[Path]) -> Iterator[tuple[list[Path], int, int]]:
@@ -313,25 +330,6 @@ def _groups(files: Iterable[Path]) -> Iterator[tuple[list[Path], int, int]]:
             group = []
         group, first, last = [*group, file], first if group else begin, end
     yield group, first, last
-
-
-def thinned(table: pa.Table) -> pa.Table:
-    """Keep one fix per ten seconds of a moving tag, one per minute of one at rest.
-
-    The table is sorted by tag and time.
-    """
-    tag, ms = table["tag"].to_numpy(), table["t"].cast(pa.int64()).to_numpy()
-    is_minute, is_step = (_begins(tag, ms // length_ms) for length_ms in (_REST_MS, _MOVING_MS))
-    first = np.flatnonzero(is_minute)
-    places = [table[name].to_numpy().astype(np.int64) for name in ("x_mm", "y_mm", "z_mm")]
-    extents = [np.maximum.reduceat(place, first) - np.minimum.reduceat(place, first) for place in places]
-    moves = np.repeat(np.max(extents, axis=0) > _REST_MM, np.diff(np.append(first, len(tag))))
-    return table.filter(pa.array(is_minute | (moves & is_step)))
-
-
-def _begins(tag: NDArray[Any], part: NDArray[Any]) -> NDArray[np.bool_]:
-    """Mark the rows where the tag, or the part of its time, differs from the row before."""
-    return np.append(True, (np.diff(tag) != 0) | (np.diff(part) != 0))
 
 
 def _remove(files: Iterable[Path]) -> None:
