@@ -9,8 +9,8 @@ from test_known_keys import CHAIN, FIRST, KEYS, PUBLIC, SITE, TIMING, count_step
 from skyless.core.air.almanac import KeyPage
 from skyless.core.air.beacon import Beacon, decode, encode, with_authentication
 from skyless.core.air.frame import Reception
-from skyless.core.anchor import NO_KEYS_S, BeaconAuthentication
 from skyless.core.keys import chain, known_keys
+from skyless.core.keys.authentication import NO_KEYS_S, BeaconAuthentication
 from skyless.core.keys.chain import SECTION_INTERVALS, mac_of
 from skyless.core.keys.fault import Fault
 from skyless.core.keys.verifier import Verifier

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from test_attacks_on_state import START_S, frame, received
 from test_known_keys import CHAIN, FIRST, KEYS, PUBLIC, SITE, TIMING
 
-from skyless.core.anchor import BeaconAuthentication
+from skyless.core.keys.authentication import BeaconAuthentication
 from skyless.core.keys.chain import SECTION_INTERVALS
 from skyless.core.keys.fault import Fault
 from skyless.core.keys.verifier import Verifier

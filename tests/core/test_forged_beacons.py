@@ -15,7 +15,8 @@ from msgspec.structs import replace
 
 from skyless.core.air.beacon import decode
 from skyless.core.air.frame import Malformed, Reception
-from skyless.core.anchor import Anchor, BeaconAuthentication
+from skyless.core.anchor import Anchor
+from skyless.core.keys.authentication import BeaconAuthentication
 from skyless.core.keys.fault import Fault
 from skyless.core.ticks import SPEED_OF_LIGHT_MPS, from_seconds, wrap
 from skyless.core.trusted_receiver import SiteTrust, Trust

@@ -10,7 +10,7 @@ from skyless.core.air.almanac import OFFERED_HZ, gap_ticks, period_code, period_
 from skyless.core.air.beacon import Beacon, decode, encode
 from skyless.core.air.frame import BLOCKED_DB, CLEAR_DB, Diagnostics, Reception
 from skyless.core.anchor import Anchor
-from skyless.core.any_receiver import new_anchor
+from skyless.core.any_anchor import new_anchor
 from skyless.core.protocol1.anchor import Anchor as Protocol1Anchor
 from skyless.core.site import AnchorSite, ScheduleSite, Site, UnplacedAnchor
 from skyless.core.ticks import difference, from_seconds, to_seconds, wrap

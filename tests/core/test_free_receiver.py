@@ -11,9 +11,9 @@ from skyless.core.air.almanac import NoisePage, SitePage, period_code
 from skyless.core.air.beacon import StatedPosition, encode
 from skyless.core.air.frame import Heard as Relay
 from skyless.core.air.site_pages import site_issue
-from skyless.core.anchor import site_page_for, site_pages_of
 from skyless.core.any_receiver import AnyReceiver
 from skyless.core.fix import NoFixReason
+from skyless.core.pages import site_page_for, site_pages_of
 from skyless.core.site import GeoreferenceSite
 from skyless.core.tag.receiver import NOT_DROPS, Receiver
 from skyless.core.ticks import from_seconds, wrap

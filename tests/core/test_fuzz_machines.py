@@ -14,7 +14,8 @@ from msgspec.structs import replace
 
 from skyless.core.air.beacon import Beacon, decode
 from skyless.core.air.frame import MAX_FRAME_BYTES, Reception
-from skyless.core.any_receiver import AnyReceiver, new_anchor
+from skyless.core.any_anchor import new_anchor
+from skyless.core.any_receiver import AnyReceiver
 from skyless.core.protocol1.anchor import Anchor
 from skyless.core.site import AnchorSite, ScheduleSite, UnplacedAnchor
 from skyless.core.ticks import TICK_RATE_HZ, wrap

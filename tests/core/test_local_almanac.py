@@ -9,10 +9,10 @@ from skyless.core.air import site_pages
 from skyless.core.air.almanac import AccuracyPage, NoisePage, SitePage
 from skyless.core.air.beacon import Beacon, StatedPosition, fields_of
 from skyless.core.air.neighbours import PRESENT_TICKS, Neighbours, find_neighbour, neighbour_of
-from skyless.core.anchor import site_page_for, site_pages_of
 from skyless.core.clock_filter import clock_noise, stamp_variances_m2
 from skyless.core.estimator.settings import EstimatorSettings
 from skyless.core.native.records import MAX_NEIGHBOURS, MAX_PAGES
+from skyless.core.pages import site_page_for, site_pages_of
 from skyless.core.site import GeoreferenceSite
 from skyless.core.tag.hearing import keep_place
 from skyless.core.tag.joint import read_accuracy

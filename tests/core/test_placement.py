@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from skyless.core.any_receiver import AnyReceiver, new_anchor
+from skyless.core.any_anchor import new_anchor
+from skyless.core.any_receiver import AnyReceiver
 from skyless.core.site import AccuracySite, ScheduleSite, UnplacedAnchor
 from skyless.sim.impairments import DelayError, lab_impairments
 from skyless.sim.lab import paper_lab_site

@@ -10,7 +10,8 @@ from msgspec.structs import replace
 
 from skyless.core.air.beacon import decode
 from skyless.core.air.frame import Reception
-from skyless.core.any_receiver import AnyReceiver, new_anchor
+from skyless.core.any_anchor import new_anchor
+from skyless.core.any_receiver import AnyReceiver
 from skyless.core.ticks import wrap
 from skyless.core.trusted_receiver import SiteTrust, Trust
 from skyless.run.masterless.smoothing import OwnReceiver

@@ -35,7 +35,6 @@ from skyless.core.air.almanac import GeoreferencePage, NoisePage, SitePage
 from skyless.core.air.beacon import Beacon, StatedPosition, decode, encode
 from skyless.core.air.frame import Diagnostics, Heard, PackedHeard
 from skyless.core.air.site_pages import site_issue
-from skyless.core.anchor import site_page_for, site_pages_of
 from skyless.core.estimator.process import ACCEPTED, Packet, process_frame
 from skyless.core.estimator.state import WORK_ROWS, State
 from skyless.core.estimator.steady_state import PlannedMessage, PlannedRelay
@@ -43,6 +42,7 @@ from skyless.core.native import arithmetic
 from skyless.core.native.library import compiled
 from skyless.core.native.records import MAX_ANCHORS, c_type
 from skyless.core.native.views import view
+from skyless.core.pages import site_page_for, site_pages_of
 from skyless.core.tag import position, receiver, search
 from skyless.core.tag.hearing import hear_frame
 from support.bench import ROOM, tape

@@ -9,7 +9,7 @@ import pytest
 from msgspec.structs import replace
 
 from skyless.cli.main import main
-from skyless.core.any_receiver import new_anchor
+from skyless.core.any_anchor import new_anchor
 from skyless.core.errors import ConfigurationError
 from skyless.core.ticks import SPEED_OF_LIGHT_MPS, TICK_RATE_HZ
 from skyless.research.calibration.biases import ranges_of

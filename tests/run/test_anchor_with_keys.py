@@ -11,8 +11,9 @@ from node_stage import FakeRadio, played
 from skyless.cli.main import main
 from skyless.core.air.beacon import decode
 from skyless.core.air.frame import Reception
-from skyless.core.anchor import Anchor, BeaconAuthentication
+from skyless.core.anchor import Anchor
 from skyless.core.errors import SkylessError
+from skyless.core.keys.authentication import BeaconAuthentication
 from skyless.core.keys.fault import Fault
 from skyless.core.site import UnplacedAnchor, site_digest
 from skyless.core.ticks import TICK_S, difference

@@ -12,7 +12,7 @@ from msgspec.structs import replace
 from node_stage import FakeLink
 
 from skyless.core.air.beacon import decode
-from skyless.core.any_receiver import new_anchor
+from skyless.core.any_anchor import new_anchor
 from skyless.core.errors import SkylessError
 from skyless.core.site import FloorPlanSite, ScheduleSite, UnplacedAnchor, site_digest
 from skyless.run.anchor import StampLog

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from skyless.core.air.frame import Heard, Reception
-from skyless.core.any_receiver import new_anchor
+from skyless.core.any_anchor import new_anchor
 from skyless.core.ticks import from_seconds, wrap
 from skyless.research.studies.surveyed_rooms import RecordedAnchor
 from skyless.sim.impairments import AnchorOutage, Outage, lab_impairments

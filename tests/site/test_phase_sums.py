@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
-from skyless.core.any_receiver import new_anchor
+from skyless.core.any_anchor import new_anchor
 from skyless.core.ticks import CARRIER_CYCLES, TICK_RATE_HZ, wrap
 from skyless.research.foreign import datasets as muloc
 from skyless.sim.impairments import AnchorDisplacement, AnchorOutage, CarrierModel, Outage, lab_impairments

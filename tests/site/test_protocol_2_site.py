@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from skyless.core.air.almanac import OFFERED_HZ, SHORTEST_PERIOD_S
-from skyless.core.any_receiver import beacon_period_s
+from skyless.core.any_anchor import beacon_period_s
 from skyless.core.errors import ConfigurationError
 from skyless.core.geometry import pairs_within
 from skyless.core.site import UnplacedAnchor

@@ -7,7 +7,7 @@ import pytest
 from msgspec.structs import replace
 
 from skyless.core.air.frame import MAX_FRAME_BYTES, air_time_s
-from skyless.core.any_receiver import beacon_period_s
+from skyless.core.any_anchor import beacon_period_s
 from skyless.core.geometry import RADIO_REACH_M
 from skyless.core.site import AnchorSite, ScheduleSite, Site, TagsSite, WallSite
 from skyless.sim.impairments import Impairments

@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 
 from skyless.core.air.site_pages import site_issue
-from skyless.core.anchor import site_pages_of
 from skyless.core.errors import ConfigurationError, SkylessError
+from skyless.core.pages import site_pages_of
 from skyless.core.site import EXACT, AccuracySite, ScheduleSite, UnplacedAnchor
 from skyless.core.ticks import TICK_M
 from skyless.sim.lab import paper_lab_site

@@ -7,7 +7,7 @@ from msgspec import Struct
 from msgspec.structs import replace
 
 from skyless.core.air.frame import Reception
-from skyless.core.any_receiver import new_anchor
+from skyless.core.any_anchor import new_anchor
 from skyless.core.protocol1.beacon import Beacon, decode, encode
 from skyless.core.site import EXACT, Site
 from skyless.sim.evaluation.scenarios import Request, impairments_of

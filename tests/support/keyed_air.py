@@ -16,10 +16,11 @@ from msgspec import Struct
 from msgspec.structs import replace
 
 from skyless.core.air.frame import Malformed, Reception, Transmission
-from skyless.core.anchor import BeaconAuthentication
-from skyless.core.any_receiver import AnchorMachine, SiteBeacon, decode_any, new_anchor
+from skyless.core.any_anchor import AnchorMachine, new_anchor
+from skyless.core.any_receiver import SiteBeacon, decode_any
 from skyless.core.arrays import Array
 from skyless.core.fix import Fix
+from skyless.core.keys.authentication import BeaconAuthentication
 from skyless.core.keys.chain import SECTION_BITS, SEED_BYTES, USUAL_TIMING, Chain, ChainTiming, section_signatures
 from skyless.core.site import AnchorSite, Site
 from skyless.core.tag.receiver import Receiver

@@ -29,7 +29,7 @@ from skyless.cli.nodes.options import SiteId
 from skyless.core.air.almanac import OFFERED_HZ, SHORTEST_PERIOD_S
 from skyless.core.air.beacon import HAS_AUTHENTICATION, HAS_PAGE, HAS_POSITION, bare_bytes
 from skyless.core.air.frame import HEARD_BYTES, MAX_FRAME_BYTES, air_time_s
-from skyless.core.any_receiver import beacon_period_s
+from skyless.core.any_anchor import beacon_period_s
 from skyless.core.errors import SkylessError
 from skyless.core.geometry import RADIO_REACH_M, anchor_positions, anchors_in_reach, pairs_within
 from skyless.core.protocol1.beacon import first_slots, schedule_of

@@ -10,7 +10,7 @@ from typing import Final
 import numpy as np
 from msgspec.structs import replace
 
-from skyless.core.any_receiver import superframe_s as period_s
+from skyless.core.any_anchor import superframe_s as period_s
 from skyless.core.arrays import Matrix
 from skyless.sim.evaluation.fleet import Fleet, FleetSettings
 from skyless.sim.evaluation.scenarios import Request, impairments_of, stated_room

@@ -12,9 +12,10 @@ from typing import Final, Literal
 from msgspec.structs import replace
 
 from skyless.core.air.frame import Malformed, Reception
-from skyless.core.anchor import BeaconAuthentication
-from skyless.core.any_receiver import AnchorMachine, decode_any, new_anchor
+from skyless.core.any_anchor import AnchorMachine, new_anchor
+from skyless.core.any_receiver import decode_any
 from skyless.core.errors import SkylessError
+from skyless.core.keys.authentication import BeaconAuthentication
 from skyless.core.protocol1.anchor import Role
 from skyless.core.site import Site, is_same_but_placed, largest_change_m, site_digest
 from skyless.core.ticks import TICK_RATE_HZ, difference

@@ -23,8 +23,8 @@ from msgspec import Struct
 from msgspec.structs import replace
 
 from skyless.core.air.beacon import CERTIFICATE_BYTES
-from skyless.core.anchor import RECENT_S, BeaconAuthentication
 from skyless.core.errors import ConfigurationError, SkylessError
+from skyless.core.keys.authentication import RECENT_S, BeaconAuthentication
 from skyless.core.keys.chain import (
     CERTIFICATE_SIGNATURE_BYTES,
     MIN_LAG,

@@ -19,9 +19,9 @@ from skyless.core.air.almanac import Page, gap_ticks, period_code, suitable_peri
 from skyless.core.air.beacon import Beacon
 from skyless.core.air.frame import Malformed, PackedHeard, Reception, after_rmarker_s, preamble_s
 from skyless.core.air.site_pages import decode_page, encode_page, site_issue
-from skyless.core.anchor import site_page_for, site_pages_of, stated_position
 from skyless.core.arrays import Array, Integers
 from skyless.core.geometry import anchor_positions, anchors_in_reach
+from skyless.core.pages import site_page_for, site_pages_of, stated_position
 from skyless.core.site import Site
 from skyless.core.ticks import (
     DELAYED_TX_GRANULARITY_TICKS,

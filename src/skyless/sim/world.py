@@ -13,7 +13,7 @@ from typing import Final
 import numpy as np
 
 from skyless.core.air.frame import Diagnostics, Reception
-from skyless.core.any_receiver import BeaconSender
+from skyless.core.any_anchor import BeaconSender
 from skyless.core.arrays import Array, Integers
 from skyless.core.site import Site
 from skyless.core.ticks import TICK_S, difference, from_seconds, wrap

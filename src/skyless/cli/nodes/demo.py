@@ -25,7 +25,7 @@ from skyless.cli.common import JsonOptions, command, console, make_folder, print
 from skyless.cli.nodes.options import MqttCa, WalkingSpeed, check_live, log, run_until_stopped, site_named
 from skyless.cli.nodes.site_view import Picture, SiteView, drawn
 from skyless.core.alert import Alert
-from skyless.core.any_receiver import beacon_period_s
+from skyless.core.any_anchor import beacon_period_s
 from skyless.core.errors import SkylessError
 from skyless.core.method_names import DEFAULT_METHOD
 from skyless.core.site import AlarmRule, FloorPlanSite, GeoreferenceSite, Site

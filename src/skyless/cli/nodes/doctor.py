@@ -26,7 +26,7 @@ from skyless.cli.common import (
 )
 from skyless.cli.nodes.options import SiteOptions, log
 from skyless.cli.nodes.site_view import GONE, LINK_NAME, SiteView, site_number
-from skyless.core.any_receiver import beacon_period_s
+from skyless.core.any_anchor import beacon_period_s
 from skyless.core.errors import SkylessError
 from skyless.core.geometry import RADIO_REACH_M
 from skyless.core.site import NoiseSite, Site, site_digest

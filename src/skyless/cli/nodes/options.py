@@ -138,7 +138,7 @@ def check_live(site: Site, method: str = DEFAULT_METHOD) -> None:
 
     Raises SkylessError.
     """
-    from skyless.core.any_receiver import beacon_period_s
+    from skyless.core.any_anchor import beacon_period_s
     from skyless.sim.evaluation.scenarios import check_can_be_simulated
 
     check_can_be_simulated(site, method)

@@ -17,7 +17,7 @@ from skyless.core.air.almanac import (
     SitePage,
 )
 from skyless.core.air.site_pages import encode_page
-from skyless.core.anchor import filter_pages_of, georeference_page_of
+from skyless.core.pages import filter_pages_of, georeference_page_of
 from skyless.core.protocol1.beacon import first_slots, schedule_of
 from skyless.core.site import AccuracySite, Site
 

@@ -20,7 +20,8 @@ from msgspec import Struct
 from msgspec.structs import replace
 
 from skyless.core.air.frame import Malformed, Reception, Transmission
-from skyless.core.any_receiver import AnchorMachine, decode_any, new_anchor
+from skyless.core.any_anchor import AnchorMachine, new_anchor
+from skyless.core.any_receiver import decode_any
 from skyless.core.arrays import Array
 from skyless.core.geometry import anchor_positions
 from skyless.core.site import EXACT, AccuracySite, AnchorSite, ScheduleSite, Site, TagsSite

@@ -14,7 +14,7 @@ import numpy as np
 from msgspec import Struct
 
 from skyless.core.alert import Alert
-from skyless.core.any_receiver import superframe_s
+from skyless.core.any_anchor import superframe_s
 from skyless.core.arrays import Array, Mask, Matrix, Vector
 from skyless.core.fix import Fix
 from skyless.core.site import Site

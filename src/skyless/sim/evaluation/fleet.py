@@ -9,7 +9,8 @@ import numpy as np
 from msgspec import Struct
 
 from skyless.core.air.frame import Reception
-from skyless.core.any_receiver import AnchorMachine, AnyReceiver, SiteBeacon, new_anchor
+from skyless.core.any_anchor import AnchorMachine, new_anchor
+from skyless.core.any_receiver import AnyReceiver, SiteBeacon
 from skyless.core.arrays import Array
 from skyless.core.fix import Fix, NoFixReason
 from skyless.core.integrity import IntegrityRequirement

@@ -18,8 +18,7 @@ from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from skyless.core.air.site_pages import encode_page
-from skyless.core.anchor import filter_pages_of
-from skyless.core.any_receiver import superframe_s
+from skyless.core.any_anchor import superframe_s
 from skyless.core.arrays import Array, Integers, Mask, Matrix, Vector
 from skyless.core.earth import geodetic
 from skyless.core.estimator import steady_state
@@ -31,6 +30,7 @@ from skyless.core.geometry import anchor_positions, inside
 from skyless.core.native.library import compiled
 from skyless.core.native.records import MAX_ANCHORS_IN_USE
 from skyless.core.native.views import records, view
+from skyless.core.pages import filter_pages_of
 from skyless.core.site import GeoreferenceSite, Site
 from skyless.core.tag.joint import fill_ages, read_accuracy
 from skyless.core.ticks import TICK_S

@@ -12,7 +12,7 @@ import numpy as np
 from msgspec import Struct
 
 from skyless.core.air.frame import MAX_FRAME_BYTES, air_time_s
-from skyless.core.any_receiver import beacon_period_s
+from skyless.core.any_anchor import beacon_period_s
 from skyless.core.arrays import Integers, Matrix, Vector
 from skyless.core.geometry import anchor_positions
 from skyless.core.native.arithmetic import square

@@ -6,7 +6,7 @@ import msgspec
 import numpy as np
 from msgspec import Struct
 
-from skyless.core.any_receiver import superframe_s
+from skyless.core.any_anchor import superframe_s
 from skyless.core.arrays import Array, Mask
 from skyless.core.fix import NoFixReason
 from skyless.core.method_names import DEFAULT_METHOD

@@ -11,7 +11,7 @@ from msgspec.structs import replace
 
 from skyless.core.air import beacon
 from skyless.core.air.frame import MAX_FRAME_BYTES, air_time_s
-from skyless.core.any_receiver import beacon_period_s
+from skyless.core.any_anchor import beacon_period_s
 from skyless.core.arrays import Integers, Mask, Matrix, Vector
 from skyless.core.clock_filter import (
     ClockNoise,
