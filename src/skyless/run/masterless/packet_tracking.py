@@ -185,9 +185,10 @@ class PacketTracking:
     @property
     def _uncalibrated(self) -> list[int]:
         """Anchors heard recently whose constants are unknown; those of Bitcraze's systems are small."""
+        if not self._has_addresses:
+            return []
         known = {} if self._calibration is None else self._calibration.anchors
-        heard = [anchor for anchor in self._heard_recently() if anchor not in known]
-        return heard if self._has_addresses else []
+        return [anchor for anchor in self._heard_recently() if anchor not in known]
 
     @property
     def notes(self) -> tuple[str, ...]:
