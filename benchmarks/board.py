@@ -126,7 +126,7 @@ def damaged(run, bits):
 
 def fixes_of(run, beacons):
     """Of each judged fix: tag, time, squared error, its normalised square, horizontal level or NaN, and if exceeded."""
-    receivers = [AnyReceiver(run.method, integrity=run.integrity) for _ in run.trajectories]
+    receivers = [AnyReceiver(run.method) for _ in run.trajectories]
     dim, rows = 2 if run.site.tags.height_m is not None else 3, []
     for beacon in beacons:
         for tag, reception, truth_m in beacon.receptions:

@@ -341,12 +341,12 @@ def point(*counts: int, farthest_m: float = math.inf) -> Rule:
     return Rule(partial(check_point, counts=counts, farthest_m=farthest_m))
 
 
-def points(*counts: int, form: str) -> Rule:
+def points(*counts: int, form: str, farthest_m: float = math.inf) -> Rule:
     """Several points or walls, ``form`` each."""
 
     def check(name: str, value: object) -> tuple[tuple[float, ...], ...]:
         found = sequence(name, value, f"{form} in metres each")
-        return tuple(check_point(f"{name}[{number}]", one, counts) for number, one in enumerate(found))
+        return tuple(check_point(f"{name}[{number}]", one, counts, farthest_m) for number, one in enumerate(found))
 
     return Rule(check)
 

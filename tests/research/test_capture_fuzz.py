@@ -60,7 +60,7 @@ def replay(path, name, rng):
         return None
 
 
-def check(fix):
+def check(_tag, _time_s, fix):
     assert all(map(isfinite, fix.position_m))
     assert all(map(isfinite, fix.covariance_m2.flat))
 

@@ -260,7 +260,7 @@ def test_anchors_that_state_other_positions_later_are_where_they_state(tmp_path)
         record["anchorLocation"]["relativeLocation"]["x"] += 100_000
     path.write_bytes(b"".join(whole[:450]) + b"".join(json.dumps(record).encode() + b"\n" for record in moved))
     found = []
-    CaptureReplay(ReplayOptions(path)).run(found.append, lambda _: None)
+    CaptureReplay(ReplayOptions(path)).run(lambda _, time_s, fix: found.append(fix), lambda _: None)
     assert found[300].position_m[0] < 20.0
     assert found[-1].position_m[0] > 80.0
 

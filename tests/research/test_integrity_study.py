@@ -7,7 +7,7 @@ from scipy.stats import chi2
 from skyless.core.ticks import TICK_M
 from skyless.research.studies import integrity
 from skyless.research.studies.efficiency import Case, draw_episode
-from skyless.research.studies.picture import CLUSTER_FIXES, clustered_interval
+from skyless.research.studies.picture import CLUSTER_FIXES, clustered_interval, draw
 from skyless.research.studies.run import STUDIES
 from skyless.research.studies.runner import plan_of
 from skyless.sim.lab import paper_lab_site
@@ -118,7 +118,7 @@ def test_levels_that_mislead_often_fail():
 def test_it_can_be_drawn(levels_m):
     study = STUDIES["integrity"]
     found = study.rows(PLAN, [chunk(3, levels_m)] * 2 * len(integrity.FAULTS))
-    assert picture(study.draw(found), "png", 50.0).startswith(b"\x89PNG")
+    assert picture(draw(study, found), "png", 50.0).startswith(b"\x89PNG")
 
 
 def test_cells_carry_what_is_asked():
@@ -126,8 +126,8 @@ def test_cells_carry_what_is_asked():
     found = integrity.cells(asked)
     assert len(found) == 2 * len(integrity.FAULTS)
     asked_of = [cell.function.args for cell in found]
-    assert {(setting.risk, setting.alert_limit_m) for setting, _ in asked_of} == {(1e-3, 0.5)}
-    assert [len(seeds) for _, seeds in asked_of[:2]] == [50, 10]
+    assert {(plan.integrity_risk, plan.alert_limit_m) for plan, *_ in asked_of} == {(1e-3, 0.5)}
+    assert [len(seeds) for *_, seeds in asked_of[:2]] == [50, 10]
 
 
 @pytest.mark.parametrize("place", ["lab", "room"])

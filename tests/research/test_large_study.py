@@ -15,8 +15,7 @@ CASES = {case.name: case for case in large.cases(PLAN)}
 
 def results(name, count=2, plan=PLAN, **changes):
     case = replace(CASES[name], **changes)
-    runs = large.tag_runs(plan, case)[:count]
-    return large.row_of(plan, case, [large.run_large(run) for run in runs])
+    return large.row_of(plan, case, [large.run_large(case, plan, number) for number in range(count)])
 
 
 def test_walking_tags_meet_the_limits():
@@ -54,7 +53,6 @@ def test_cold_starts_anywhere():
 
 
 def test_the_same_seed_gives_the_same_numbers_wherever_it_runs():
-    run = large.tag_runs(PLAN, CASES["random instants"])[1]
-    one, other = large.run_large(run), large.run_large(run)
+    one, other = (large.run_large(CASES["random instants"], PLAN, 1) for _ in range(2))
     assert one.fixes == other.fixes
     np.testing.assert_array_equal(one.errors_m, other.errors_m)

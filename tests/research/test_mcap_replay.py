@@ -43,7 +43,7 @@ def replayed_fixes(path, **options):
     """All fixes of the only tag, with their Unix times."""
     found = []
     with McapRecording(path) as recording:
-        SiteReplay(recording, **options).run(lambda _, made: found.append((made.unix_s, made.fix)), lambda _: None)
+        SiteReplay(recording, **options).run(lambda _, unix_s, fix: found.append((unix_s, fix)), lambda _: None)
     return found
 
 

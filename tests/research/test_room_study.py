@@ -17,7 +17,7 @@ from skyless.research.studies.run import Parts
 from skyless.research.studies.runner import Limit, plan_of, with_limits
 from skyless.research.studies.worlds import RunResult, box, run_world
 from skyless.research.uncertainty import Biases
-from skyless.sim.evaluation.figures import LevelCounts, LevelTally
+from skyless.sim.evaluation.figures import LevelTally
 from skyless.sim.impairments import Body
 from skyless.sim.lab import lab_site
 from skyless.site.channel import barriers_of, cross_walls
@@ -257,7 +257,6 @@ class FixWithoutLevels:
 def test_levels_are_counted_for_each_tag():
     counter = LevelTally(2, 100)
     counter.add(0, FixWithoutLevels(), np.ones(3))
-    assert counter.counts() is None
     assert counter.report() is None
     for tag, hpl_m, across_m, alert in (
         (0, 0.1, 0.05, Alert.NONE),
@@ -266,19 +265,22 @@ def test_levels_are_counted_for_each_tag():
         (1, None, 9.0, Alert.UNAVAILABLE),
     ):
         counter.add(tag, FixWithLevel(hpl_m, alert), np.array((0.6 * across_m, 0.8 * across_m, 9.0)))
-    counts = counter.counts()
-    assert [list(part) for part in (counts.fixes, counts.levels, counts.exceeded, counts.unwarned)] == [
-        [2, 2],
-        [2, 1],
-        [1, 1],
-        [1, 0],
-    ]
-    assert sorted(counts.hpl_m) == [0.1, 0.1, 0.3]
+    counts = counter.fixes, counter.levels, counter.exceeded, counter.unwarned
+    assert [part.tolist() for part in counts] == [[2, 2], [2, 1], [1, 1], [1, 0]]
+    assert sorted(counter.hpl_m) == [0.1, 0.1, 0.3]
     report = counter.report()
     assert (report.available, report.misleading, report.hpl_m) == (0.75, 2, 0.1)
     assert report.alerts == {"detected-excluded": 1, "none": 2, "unavailable": 1}
     counter.add(0, FixWithLevel(1.0, Alert.NONE, vpl_m=0.5), np.array((0.1, 0.1, -0.6)))
     assert counter.report().misleading == 3
+
+
+class CountedLevels:
+    """A tally of two tags with nine judged fixes."""
+
+    def __init__(self, levels, exceeded, unwarned, hpl_m):
+        self.levels, self.exceeded, self.unwarned = np.array([levels, exceeded, unwarned])
+        self.hpl_m = np.array(hpl_m)
 
 
 def _results(plan, levels):
@@ -290,7 +292,7 @@ def _results(plan, levels):
 
 def test_rows_have_shares_of_the_fixes_with_a_level_and_intervals_over_tags():
     plan = plan_of("joint", 1, study="room", worlds=2)
-    counts = LevelCounts(*map(np.array, ([4.0, 5.0], [4.0, 2.0], [3.0, 0.0], [1.0, 0.0])), hpl_m=np.array([0.1, 0.4]))
+    counts = CountedLevels((4.0, 2.0), (3.0, 0.0), (1.0, 0.0), (0.1, 0.4))
     rows = room.rows(plan, _results(plan, counts))
     row = rows[0]
     assert row.level == pytest.approx(12.0 / 18.0)
@@ -305,7 +307,7 @@ def test_rows_have_shares_of_the_fixes_with_a_level_and_intervals_over_tags():
         *("constants change in 10 s",),
         *("constants change within 1 m", "constants within 10 cm", "each axis N(5 cm)"),
     }
-    none = LevelCounts(*map(np.array, ([4.0, 5.0], [0.0, 0.0], [0.0, 0.0], [0.0, 0.0])), hpl_m=np.empty(0))
+    none = CountedLevels((0.0, 0.0), (0.0, 0.0), (0.0, 0.0), ())
     row = room.rows(plan, _results(plan, none))[0]
     assert (row.level, row.exceeded, row.hpl_m) == (0.0, None, None)
 
@@ -314,7 +316,7 @@ def test_rows_have_shares_of_the_fixes_with_a_level_and_intervals_over_tags():
 def test_the_table_shows_levels_and_what_is_missed(capsys, monkeypatch):
     monkeypatch.setenv("COLUMNS", "200")
     plan = plan_of("joint", 1, study="room", worlds=2)
-    counts = LevelCounts(*map(np.array, ([4.0, 5.0], [4.0, 2.0], [3.0, 0.0], [1.0, 0.0])), hpl_m=np.array([0.1, 0.4]))
+    counts = CountedLevels((4.0, 2.0), (3.0, 0.0), (1.0, 0.0), (0.1, 0.4))
     rows = room.rows(plan, _results(plan, counts))
     print_rows(StudyResult("room", plan, tuple(rows), 1.0, Parts(1, 0, ())))
     out = capsys.readouterr().out

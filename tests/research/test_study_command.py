@@ -16,6 +16,7 @@ import pytest
 
 from skyless.cli.main import main
 from skyless.research.studies import room
+from skyless.research.studies.picture import draw
 from skyless.research.studies.run import STUDIES
 from skyless.research.studies.runner import plan_of
 from skyless.research.studies.worlds import RunResult, run_world
@@ -99,7 +100,7 @@ def test_all_conditions_can_be_drawn(conditions):
     for results in ([some], [none], [some, none]):
         worlds = cycle(results)
         rows = study.rows(plan, [next(worlds) if cell.function.func is run_world else 0.02**2 for cell in cells])
-        assert picture(study.draw(rows), "png", 50.0).startswith(b"\x89PNG")
+        assert picture(draw(study, rows), "png", 50.0).startswith(b"\x89PNG")
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,7 @@ import pytest
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
-from skyless.research.studies.picture import CONFIDENCE, STATED_RISK, shade_sides
+from skyless.research.studies.picture import CONFIDENCE, STATED_RISK, draw, shade_sides
 from skyless.research.studies.run import STUDIES
 from skyless.research.studies.runner import Limit
 
@@ -35,12 +35,12 @@ def words_of(figure):
 def test_every_figure_that_can_mislead_names_its_safe_side(name):
     for x in (None, 1.0):
         rows = [row(name, n, f"case {n}", "a series", x and n + x) for n in range(3)]
-        assert "safe side" in words_of(STUDIES[name].draw(rows))
+        assert "safe side" in words_of(draw(STUDIES[name], rows))
 
 
 def test_levels_name_theirs():
     faults = [row("integrity", n, f"lab, step {n} m", "lab, step", float(n)) for n in range(1, 4)]
-    words = words_of(STUDIES["integrity"].draw([row("integrity", 0, "lab, clean", "lab, clean", 0.0), *faults]))
+    words = words_of(draw(STUDIES["integrity"], [row("integrity", 0, "lab, clean", "lab, clean", 0.0), *faults]))
     assert STATED_RISK.above in words
     assert "too confident" in words
 

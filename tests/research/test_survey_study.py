@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from skyless.research.studies import survey as study
+from skyless.research.studies.picture import draw
 from skyless.research.studies.run import STUDIES
 from skyless.research.studies.runner import Plan
 from skyless.research.studies.survey import GROUPS, Group, Variant, limits_of
@@ -47,7 +48,7 @@ def test_rows_of_few_runs(monkeypatch):
     assert kept.bound_m == pytest.approx(0.02 * np.sqrt(2.0))
     assert kept.delay_m < 0.1
     assert late.runs == 2
-    assert picture(chosen.draw([exact, kept]), "svg")
+    assert picture(draw(chosen, [exact, kept]), "svg")
 
 
 def test_alignment_takes_motion_and_reflection_away():

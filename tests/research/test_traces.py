@@ -49,7 +49,7 @@ def recorded(name, folder):
         folder / file, anchors=anchors and folder / anchors, uncalibrated=bool(anchors), first_s=RECORDED_S
     )
     fixes = []
-    CaptureReplay(options).run(fixes.append, lambda _: None)
+    CaptureReplay(options).run(lambda _, time_s, fix: fixes.append(fix), lambda _: None)
     begin_s = fixes[0].time_s
     return thinned(((fix.time_s - begin_s, fix.position_m, fix.covariance_m2, fix.hpl_m) for fix in fixes), RECORDED_S)
 

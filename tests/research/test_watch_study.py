@@ -3,9 +3,10 @@
 import pytest
 
 from skyless.research.studies import watch
+from skyless.research.studies.picture import draw
 from skyless.research.studies.run import STUDIES
 from skyless.research.studies.runner import Plan
-from skyless.research.studies.watch import WatchCase, WatchResult, WatchRun, run_watch
+from skyless.research.studies.watch import WatchCase, WatchResult, run_watch
 from skyless.site.report import picture
 
 pytestmark = pytest.mark.site
@@ -33,7 +34,7 @@ def test_rows_hold_what_was_found_and_are_judged(few):
     assert rows["hall, one link 35 cm late"].passed is True
     assert rows["lab, nothing, drift of 60 s"].alarms_per_day == 1.0
     assert rows["lab, 10⁶ windows of noise"].passed is True
-    picture(study.draw(list(rows.values())), "png", 40.0)
+    picture(draw(study, list(rows.values())), "png", 40.0)
 
 
 def test_cells_compute_and_runs_of_one_seed_are_the_same(few):
@@ -44,5 +45,5 @@ def test_cells_compute_and_runs_of_one_seed_are_the_same(few):
 
 
 def test_a_late_link_is_no_displacement():
-    result = run_watch(WatchRun(WatchCase("", "", "lab", "link", 0.35), 5, seed=5))
+    result = run_watch(WatchCase("", "", "lab", "link", 0.35), 5, seed=5)
     assert (result.tries, result.found, result.wrong, result.alarms_moved) == (5, 5, 0, 0)

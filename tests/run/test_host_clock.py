@@ -92,7 +92,7 @@ def test_a_replay_judges_after_a_stall_of_the_air_as_the_live_run_did(tmp_path):
     found = {}
     with McapRecording(path) as recording:
         replay = SiteReplay(recording, settle_s=0.3)
-        (report,) = replay.run(lambda _, made: found.update({tuple(made.fix.position_m): made.unix_s}), lambda _: None)
+        (report,) = replay.run(lambda _, unix_s, fix: found.update({tuple(fix.position_m): unix_s}), lambda _: None)
     assert report.fixes == len(found) > 200
     assert max(abs(at_s - live[position_m]) for position_m, at_s in found.items()) < 0.01
     assert report.max_2d_m < 0.3

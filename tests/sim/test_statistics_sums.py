@@ -37,8 +37,6 @@ def test_sums_are_those_of_exact_arithmetic(rows, planar):
         assert summary.rmse_3d_m is None
     else:
         assert summary.rmse_3d_m == pytest.approx(float(sum(squares)) ** 0.5, **tolerance)
-    spread = [float(square - mean * mean) ** 0.5 for square, mean in zip(squares, means, strict=True)]
-    assert statistics.std() == pytest.approx(spread, rel=1e-6, abs=1e-5)
 
 
 @given(vectors, st.booleans())
@@ -47,14 +45,6 @@ def test_percentile_and_maximum_are_numpys(rows, planar):
     summary = filled(rows, planar).summary()
     assert summary.p95_m == pytest.approx(np.percentile(errors, 95), rel=1e-12)
     assert summary.max_m == pytest.approx(errors.max(), rel=1e-12)
-
-
-def test_a_common_offset_costs_no_digits():
-    """A millimetre of noise a thousand kilometres off keeps its spread to six digits."""
-    noise = np.random.default_rng(1).normal(0.0, 1e-3, (5000, 3))
-    rows = noise + 1e6
-    spread = filled(rows.tolist(), False).std()
-    assert spread == pytest.approx(np.std(rows, axis=0).tolist(), rel=1e-6)
 
 
 def test_nothing_to_judge():

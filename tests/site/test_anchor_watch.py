@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from skyless.research.calibration.biases import ranges_of
 from skyless.research.studies.surveyed_rooms import survey_layouts
-from skyless.research.studies.watch import WatchCase, WatchRun, run_watch, striking_windows
+from skyless.research.studies.watch import WatchCase, run_watch, striking_windows
 from skyless.site.survey.explain import sentence_of
 from skyless.site.survey.facts import PairBlock
 from skyless.site.survey.pair_ranger import PairRanger
@@ -52,7 +52,7 @@ class Ranges:
 
 
 def drawn(layout, event, size_m, events, seed, drift_m=(0.02, 0.02), *, missing=0.0):
-    return run_watch(WatchRun(WatchCase("", "", layout, event, size_m, drift_m, missing=missing), events, seed))
+    return run_watch(WatchCase("", "", layout, event, size_m, drift_m, missing=missing), events, seed)
 
 
 def test_noise_strikes_no_more_often_than_stated():
@@ -82,8 +82,8 @@ def test_an_anchor_that_creeps_is_found():
 
 
 def test_drift_of_a_real_room_is_no_finding():
-    run = WatchRun(WatchCase("", "", "lab", "none", 0.0, (0.008, 0.025), 60.0, 0.09), 500, seed=87)
-    assert run_watch(run).alarms == 0
+    case = WatchCase("", "", "lab", "none", 0.0, (0.008, 0.025), 60.0, 0.09)
+    assert run_watch(case, 500, seed=87).alarms == 0
 
 
 def test_a_finding_stays_until_the_anchor_is_put_back():

@@ -31,9 +31,8 @@ from skyless.core.method_names import METHODS, SNAPSHOTS
 from skyless.research.replays.options import ReplayOptions
 
 if TYPE_CHECKING:
-    from skyless.cli.api.replay import OnFix
     from skyless.core.fix import Fix
-    from skyless.research.replays.captures import ReplayReport
+    from skyless.research.replays.captures import OnFix, ReplayReport
 
 FIXES_COLUMNS: Final = (
     *("t_s", "x_m", "y_m", "z_m", "vx_mps", "vy_mps", "vz_mps"),

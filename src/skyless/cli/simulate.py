@@ -58,7 +58,6 @@ def simulate(*, asked: SimulateOptions, output: _Output) -> int:
     Ends with exit code 1 if no fix was judged, and names the reason.
     """
     check_output("fixes-csv", output.fixes_csv, asked.site if isinstance(asked.site, Path) else None)
-    from skyless.cli.api.fixes import FixRecorder
     from skyless.cli.api.simulate import Simulation, SimulationResult
 
     with progress_bar("simulating") as reach:
@@ -69,7 +68,7 @@ def simulate(*, asked: SimulateOptions, output: _Output) -> int:
             if write is not None:
                 write(FIXES_CSV_COLUMNS)
             found = simulation.run(None if write is None else lambda judged: write(_row(judged)))
-    result = SimulationResult(simulation.request, found, FixRecorder(simulation.tags).fixes())
+    result = SimulationResult(simulation.request, found)
     if output.json:
         print_json(result.summary)
     else:

@@ -13,7 +13,7 @@ import msgspec
 from cyclopts import App
 from msgspec.structs import replace
 
-from skyless.arguments import Option, Options, Positive, Rule, Seed, Text, folder_to_write, numbers, point
+from skyless.arguments import Rule, Seed, folder_to_write
 from skyless.cli.api.options import StudyOptions
 from skyless.cli.common import (
     JsonOptions,
@@ -28,15 +28,13 @@ from skyless.cli.common import (
     say_written,
     to_json,
 )
-from skyless.core.air.site_pages import MAX_COORDINATE_M
 from skyless.core.errors import SkylessError
 from skyless.files import write_whole
-from skyless.research.replays.options import check_estimator, read_estimator
+from skyless.research.replays.options import BenchmarkOptions
 
 if TYPE_CHECKING:
     from skyless.cli.api.study import StudyResult
     from skyless.research.studies.runner import Row
-    from skyless.run.masterless.smoothing import OwnEstimator
 
 _LEGENDS: Final = {
     "efficiency": (
@@ -173,18 +171,16 @@ def _percent(share: float | None) -> str:
     return "" if share is None else f"{100.0 * share:.1f} %"
 
 
-def _figure(value: float | None, factor: float = 1.0, error: float | None = None, digits: int = 2) -> str:
-    if value is None:
-        return ""
-    after = "" if error is None else f" ± {factor * error:.{digits}f}"
-    return f"{factor * value:.{digits}f}{after}"
-
-
 _Cell: TypeAlias = Callable[["Row"], str]
 
 
 def _number(name: str, factor: float = 1.0, digits: int = 2, error: str = "") -> _Cell:
-    return lambda row: _figure(getattr(row, name, None), factor, getattr(row, error, None), digits)
+    def cell(row: "Row") -> str:
+        value, std = (getattr(row, one, None) for one in (name, error))
+        after = "" if std is None else f" ± {factor * std:.{digits}f}"
+        return "" if value is None else f"{factor * value:.{digits}f}{after}"
+
+    return cell
 
 
 def _share(name: str, words: Callable[[float | None], str] = _percent) -> _Cell:
@@ -300,33 +296,6 @@ def paper(*, out: Path, seed: Seed = 1, quick: bool = False, output: JsonOptions
 benchmark_app = App(name="benchmark", help_epilogue="Example: skyless benchmark recordings --quick --out compared")
 
 
-class BenchmarkOptions(Options, frozen=True, kw_only=True):
-    """Options of ``skyless benchmark``."""
-
-    out: Path = Path("benchmark")
-    """Write the result here, into a folder: index.html, results.csv and results.json. What is there already is kept."""
-    only: str = ""
-    """Only recordings whose name holds this text."""
-    lever_arm_m: Annotated[
-        tuple[float, float, float] | None,
-        Option("lever-arm"),
-        numbers(3, form="x,y,z"),
-        point(3, farthest_m=MAX_COORDINATE_M),
-    ] = None
-    """The antenna in the body's frame, in metres, added to the truth of tables."""
-    calibrate_on: Annotated[tuple[str, ...], Option("calibrate-on"), Text(lambda _, text: text, "NAME", many=True)] = ()
-    """Calibrate anchors on recordings whose names hold this text, for each table of anchors on the first; others with
-    the same table are replayed with that as well."""
-    estimator: Annotated[
-        "Callable[[], OwnEstimator] | None", Text(read_estimator, "FILE.py:CLASS"), Rule(check_estimator)
-    ] = None
-    """Your own estimator as one more method: a class with hear(observation)."""
-    first_s: Annotated[Positive | None, Option("only-first")] = None
-    """Replay only this number of seconds of each recording."""
-    quick: bool = False
-    """Compute a fraction: the first twelve seconds of each recording, without smoothing; about a minute for thirty."""
-
-
 @benchmark_app.default
 @command
 def benchmark(folder: Path, /, *, asked: BenchmarkOptions, output: JsonOptions) -> None:
@@ -340,7 +309,6 @@ def benchmark(folder: Path, /, *, asked: BenchmarkOptions, output: JsonOptions) 
         raise SkylessError(f"FOLDER is {str(folder)!r}; it should be a folder with recordings")
     from skyless.research.benchmark import (
         SUMMARY_HEADS,
-        Asked,
         recordings_below,
         results_of,
         summary_rows,
@@ -353,17 +321,11 @@ def benchmark(folder: Path, /, *, asked: BenchmarkOptions, output: JsonOptions) 
         raise SkylessError(f"FOLDER is {str(folder)!r}; it should hold recordings that skyless replay can read")
     kept = asked.out / "results"
     make_folder("--out", kept)
-    first_s = 12.0 if asked.quick and asked.first_s is None else asked.first_s
-    own = asked.estimator
-    estimators = {} if own is None else {getattr(own, "__name__", "own"): own}
-    code = getattr(getattr(own, "hear", own), "__code__", None)
-    programs = () if code is None else (Path(code.co_filename),)
-    how = Asked(asked.lever_arm_m, first_s, asked.calibrate_on, estimators, programs, not asked.quick)
     try:
         with progress_bar("replaying") as reach:
-            results = list(with_best(list(results_of(found, how, kept, reach))))
+            results = list(with_best(list(results_of(found, asked, kept, reach))))
         title = f"{len(found)} recording{'s' * (len(found) != 1)}" + (
-            "" if first_s is None else f", the first {first_s:g} s of each"
+            "" if asked.seconds is None else f", the first {asked.seconds:g} s of each"
         )
         write(asked.out, results, title, shlex.join(["skyless", *sys.argv[1:]]))
     except KeyboardInterrupt:
@@ -374,7 +336,7 @@ def benchmark(folder: Path, /, *, asked: BenchmarkOptions, output: JsonOptions) 
     summary = list(summary_rows(results))
     if output.json:
         rows = [dict(zip(SUMMARY_HEADS, row, strict=True)) for row in summary]
-        print_json({"recordings": len(found), "seconds": first_s, "methods": rows})
+        print_json({"recordings": len(found), "seconds": asked.seconds, "methods": rows})
         return
     print_table(title, SUMMARY_HEADS, summary, figures=True)
     console().print(f"{asked.out / 'index.html'}: each recording; results.csv and results.json beside it")

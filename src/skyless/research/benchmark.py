@@ -32,9 +32,8 @@ from skyless.research.calibration.biases import biases_of, tdoas_of
 from skyless.research.calibration.options import CalibrateOptions
 from skyless.research.foreign.formats import format_of, open_recording
 from skyless.research.replays.captures import CaptureReplay, known_anchors, known_truth
-from skyless.research.replays.options import ReplayOptions
+from skyless.research.replays.options import BenchmarkOptions, ReplayOptions
 from skyless.research.replays.site import SITE_FORMAT, SiteReplay
-from skyless.run.masterless.smoothing import OwnEstimator
 from skyless.run.recordings.recording import McapRecording, is_mcap
 from skyless.sim.evaluation.figures import Figures, FixTable, Judged, figures_of, truth_at
 from skyless.site.report import bullets, page, panel, picture, report_style, svg_figure, table
@@ -335,40 +334,28 @@ class Result(Struct, frozen=True):
     """Rows of time, position, truth and levels of an even sample of the fixes; None if unknown."""
 
 
-class Asked(Struct, frozen=True):
-    """How recordings are replayed."""
-
-    lever_arm_m: tuple[float, float, float] | None
-    first_s: float | None
-    calibrate_on: Sequence[str]
-    estimators: Mapping[str, Callable[[], OwnEstimator]]
-    """By their classes' names."""
-    programs: tuple[Path, ...]
-    """The files of the estimators."""
-    smooth: bool = True
-
-    def is_calibrated_on(self, found: Found) -> bool:
-        """Whether the anchors are calibrated on this recording."""
-        named = any(word in found.name for word in self.calibrate_on)
-        return named and found.truth is not None and found.anchors is not None
+def is_calibrated_on(found: Found, asked: BenchmarkOptions) -> bool:
+    """Whether the anchors are calibrated on this recording."""
+    named = any(word in found.name for word in asked.calibrate_on)
+    return named and found.truth is not None and found.anchors is not None
 
 
-def methods_of(found: Found, asked: Asked, calibrated: Collection[Path | None]) -> Iterator[str]:
+def methods_of(found: Found, asked: BenchmarkOptions, calibrated: Collection[Path | None]) -> Iterator[str]:
     """Methods for replaying a recording; ``calibrated``: tables of anchors that are calibrated."""
     yield JOINT
     if found.format == SITE_FORMAT:
         return
-    yield from (*((SMOOTHED,) if asked.smooth else ()), PLAIN, BITCRAZE_RULE, *SIMPLE)
-    if found.anchors in calibrated and not asked.is_calibrated_on(found):
+    yield from (*(() if asked.quick else (SMOOTHED,)), PLAIN, BITCRAZE_RULE, *SIMPLE)
+    if found.anchors in calibrated and not is_calibrated_on(found, asked):
         yield CALIBRATED
     yield from asked.estimators
 
 
 def results_of(
-    found: Sequence[Found], asked: Asked, kept: Path, on_progress: Callable[[float], None]
+    found: Sequence[Found], asked: BenchmarkOptions, kept: Path, on_progress: Callable[[float], None]
 ) -> Iterator[Result]:
     """Yield all results as they come; those in the folder ``kept`` are not computed again."""
-    calibrated = {one.anchors for one in found if asked.is_calibrated_on(one)}
+    calibrated = {one.anchors for one in found if is_calibrated_on(one, asked)}
     cells = [(one, method) for one in found for method in methods_of(one, asked, calibrated)]
     calibrations: dict[Path, DifferenceCalibration] = {}
     for number, (one, method) in enumerate(cells):
@@ -414,24 +401,24 @@ def _newest_source() -> int:
     return max(source.stat().st_mtime_ns for source in Path(skyless.__file__).parent.rglob("*.py"))
 
 
-def _key(found: Found, method: str, asked: Asked) -> str:
+def _key(found: Found, method: str, asked: BenchmarkOptions) -> str:
     """Name of a result; anything that could change the result changes the name."""
-    programs = asked.programs if method in asked.estimators else ()
-    files = [one for one in (found.path, found.truth, found.anchors, *programs) if one]
+    program = asked.program if method in asked.estimators else None
+    files = [one for one in (found.path, found.truth, found.anchors, program) if one]
     states = [(str(one), one.stat().st_size, one.stat().st_mtime_ns) for one in files if one.is_file()]
     given = (
         _newest_source(),
         states,
         method,
         asked.lever_arm_m,
-        asked.first_s,
+        asked.seconds,
         tuple(asked.calibrate_on) * (method == CALIBRATED),
     )
     return hashlib.sha256(repr(given).encode()).hexdigest()[:24]
 
 
 def _results(
-    found: Found, method: str, asked: Asked, calibrations: Mapping[Path, DifferenceCalibration]
+    found: Found, method: str, asked: BenchmarkOptions, calibrations: Mapping[Path, DifferenceCalibration]
 ) -> Iterator[Result]:
     if found.format == SITE_FORMAT:
         yield from _site_results(found)
@@ -457,11 +444,11 @@ def _site_results(found: Found) -> Iterator[Result]:
     with McapRecording(found.path) as recording:
         run = SiteReplay(recording)
         run.run(None, lambda _: None)
-    for tag, samples in run.samples.items():
-        yield _result(f"{found.name} {tag}", JOINT, samples.table(), run.judged(tag), samples.count)
+    for tag, replay in run.tags.items():
+        yield _result(f"{found.name} {tag}", JOINT, replay.samples.table(), run.judged(tag), replay.samples.count)
 
 
-def _options(found: Found, asked: Asked) -> ReplayOptions:
+def _options(found: Found, asked: BenchmarkOptions) -> ReplayOptions:
     arm_m = asked.lever_arm_m if found.has_body_truth else None
     return ReplayOptions(
         found.path,
@@ -469,15 +456,15 @@ def _options(found: Found, asked: Asked) -> ReplayOptions:
         truth=found.truth,
         lever_arm_m=arm_m,
         uncalibrated=True,
-        first_s=asked.first_s,
+        first_s=asked.seconds,
     )
 
 
-def _calibrations(found: Sequence[Found], asked: Asked) -> dict[Path, DifferenceCalibration]:
+def _calibrations(found: Sequence[Found], asked: BenchmarkOptions) -> dict[Path, DifferenceCalibration]:
     """What ``skyless calibrate`` finds on the named recordings, by their tables of anchors."""
     calibrations: dict[Path, DifferenceCalibration] = {}
     for one in found:
-        if asked.is_calibrated_on(one) and one.anchors is not None:
+        if is_calibrated_on(one, asked) and one.anchors is not None:
             truth = known_truth(one.path, _options(one, asked))
             assert truth is not None
             rows = np.column_stack([truth.t_s, truth.position_m])

@@ -321,8 +321,7 @@ def tracking_bound(
     known = np.ones((frames, n + 1), np.bool_)
     known[:, :-1] = settings.mesh | (senders == 0)[:, None]
     known[np.arange(frames), senders] = False
-    sendings = Sendings(senders, settings.slot_s * np.arange(frames, dtype=np.float64))
-    return _frame_bound(anchors, path, settings, known, sendings, biases, settings.at_once)[n - 1 :: n]
+    return received_bound(anchors, path, settings, known, None, biases, at_once=settings.at_once)[n - 1 :: n]
 
 
 class Sendings(Struct, frozen=True):
@@ -341,12 +340,15 @@ def received_bound(
     known: Mask,
     sendings: Sendings | None = None,
     biases: Biases = Biases(),  # noqa: B008 - a frozen value
+    *,
+    at_once: bool = True,
 ) -> Array:
     """Posterior bound of the position after every frame, shape (frames, dims, dims), in m², where frames are lost.
 
     ``anchors_m``: shape (n, 3), in the order of their slots, the reference first. ``path_m``: where the tag is at each
     frame, shape (frames, 3). ``known``: as of ``relayed_receptions``, shape (frames, n + 1); it, not the settings,
     states what of the mesh is known. ``sendings``: who sends when, if not one anchor after the other in equal slots.
+    Where receptions are not known ``at_once`` the bound holds at the end of a superframe.
 
     Raises ValueError: there is not one row of ``known`` and one sending for each position.
     """
@@ -358,34 +360,8 @@ def received_bound(
         sendings = Sendings(np.arange(frames) % n, settings.slot_s * np.arange(frames, dtype=np.float64))
     if not len(sendings.senders) == len(sendings.times_s) == frames:
         raise ValueError(f"sendings has {len(sendings.senders)} frames; it should be {frames}")
-    return _frame_bound(anchors, path, settings, known, sendings, biases, True)
-
-
-def relayed_receptions(
-    senders: Integers, sequences: Integers, relays: Sequence[Iterable[tuple[int, int]]], anchors: int
-) -> Mask:
-    """Which anchors' receptions of each beacon another beacon has relayed to the tag, shape (frames, anchors + 1).
-
-    The frames are those that the tag has received, which its own column, the last, says. ``senders``: index of each
-    frame's anchor; ``relays``: of each frame, anchor and sequence number of the beacons whose reception it relays.
-    """
-    known = np.zeros((len(senders), anchors + 1), np.bool_)
-    known[:, -1] = True
-    newest: dict[tuple[int, int], int] = {}
-    for frame, (listener, sequence) in enumerate(zip(senders.tolist(), sequences.tolist(), strict=True)):
-        for beacon in relays[frame]:
-            if beacon in newest:
-                known[newest[beacon], listener] = True
-        newest[listener, sequence] = frame
-    return known
-
-
-def _frame_bound(
-    anchors: Array, path: Array, settings: BoundSettings, known: Mask, sendings: Sendings, biases: Biases, at_once: bool
-) -> Array:
-    """Bound after every frame; where receptions are not known at once it holds at the end of a superframe."""
     s = _prior(anchors, settings, biases)
-    n, dim, senders = len(anchors), s.dim, sendings.senders.tolist()
+    dim, senders = s.dim, sendings.senders.tolist()
     ticks = np.rint(sendings.times_s / TICK_S).astype(np.int64).tolist()
     walked_m = np.cumsum(np.linalg.norm(np.diff(path, axis=0, prepend=path[:1]), axis=1)).tolist()
     s.status.epoch_ticks = ticks[0]
@@ -413,6 +389,25 @@ def _frame_bound(
         if at_once:
             bound[frame] = P
     return bound
+
+
+def relayed_receptions(
+    senders: Integers, sequences: Integers, relays: Sequence[Iterable[tuple[int, int]]], anchors: int
+) -> Mask:
+    """Which anchors' receptions of each beacon another beacon has relayed to the tag, shape (frames, anchors + 1).
+
+    The frames are those that the tag has received, which its own column, the last, says. ``senders``: index of each
+    frame's anchor; ``relays``: of each frame, anchor and sequence number of the beacons whose reception it relays.
+    """
+    known = np.zeros((len(senders), anchors + 1), np.bool_)
+    known[:, -1] = True
+    newest: dict[tuple[int, int], int] = {}
+    for frame, (listener, sequence) in enumerate(zip(senders.tolist(), sequences.tolist(), strict=True)):
+        for beacon in relays[frame]:
+            if beacon in newest:
+                known[newest[beacon], listener] = True
+        newest[listener, sequence] = frame
+    return known
 
 
 def _prior(anchors: Array, settings: BoundSettings, biases: Biases) -> State:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 from msgspec import Struct
 
-from skyless.arguments import wrong
+from skyless.arguments import check_choice
 from skyless.core.air.masterless_packets import Packet, PairTdoa
 from skyless.core.arrays import Array, Integers, Mask, Matrix, Vector
 from skyless.core.fix import Fix
@@ -16,6 +16,7 @@ from skyless.machine import extra_module
 from skyless.sim.evaluation.figures import axes_std_m
 
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure
     from pandas import DataFrame
 
 # Common to all results: a short table in a notebook, one line elsewhere, a table for pandas.
@@ -114,9 +115,7 @@ class Fixes(Struct, frozen=True, eq=False):
 
     def of_tag(self, name: str | None) -> Mask:
         """Mask of a tag's fixes, shape (n,); by default of the first tag. Raises SkylessError."""
-        if name is not None and name not in self.tags:
-            raise wrong("tag", name, f"one of {', '.join(self.tags)}")
-        mask: Mask = self.tag == (0 if name is None else self.tags.index(name))
+        mask: Mask = self.tag == (0 if name is None else self.tags.index(check_choice("tag", name, self.tags)))
         return mask
 
     def track(self, name: str | None) -> Matrix:
@@ -198,6 +197,42 @@ class FixRecorder:
             truth_m=rows[:, 22:25],
             judged=rows[:, 25] > 0.0,
         )
+
+
+class FixesResult(Result, frozen=True, eq=False, kw_only=True):
+    """A result with fixes of one or more tags."""
+
+    fixes: Fixes = FixRecorder(()).fixes()
+    """All fixes, with the truth, which is NaN where unknown; ``judged`` marks those that count in the figures."""
+
+    @property
+    def tags(self) -> tuple[str, ...]:
+        """Names of the tags."""
+        return self.fixes.tags
+
+    def track(self, tag: str) -> Matrix:
+        """Rows of time, position, true position and σ of x, y and z of a tag, shape (k, 10)."""
+        return self.fixes.track(tag)
+
+    def to_dataframe(self) -> "DataFrame":
+        """See ``Fixes.to_dataframe``."""
+        return self.fixes.to_dataframe()
+
+    def plot(self, tag: str | None = None) -> "Figure":
+        """Draw track, height, errors and stated σ over time, and error distributions of a tag, by default the first.
+
+        Raises:
+            SkylessError: there is no such tag.
+        """
+        from skyless.research.replays.plot import track_figure
+
+        name: str = check_choice("tag", self.tags[0] if tag is None else tag, self.tags)
+        rows = self.track(name)
+        return track_figure(rows, self._heading(name, len(rows)))
+
+    def _heading(self, tag: str, count: int) -> str:
+        """Title of the picture of a tag's fixes."""
+        raise NotImplementedError
 
 
 # An estimator's input from a recording as arrays, one row per reception or time difference.

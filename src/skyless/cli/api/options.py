@@ -30,14 +30,11 @@ from skyless.arguments import (
 )
 from skyless.core.errors import SkylessError
 from skyless.core.method_names import DEFAULT_METHOD
-from skyless.research.replays.options import check_estimator, read_estimator
+from skyless.research.replays.options import EstimatorClass
 from skyless.sim.evaluation.request import Conditions, IntegrityRisk, ProtectionOptions
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from skyless.core.site import Site
-    from skyless.run.masterless.smoothing import OwnEstimator
 
 _USUAL_DURATION_S = 60.0
 """Duration of a simulation without a goal."""
@@ -53,9 +50,7 @@ class SimulateOptions(Conditions, frozen=True, kw_only=True):
     site: Annotated["Site | str | Path | None", Path] = None
     """Site file instead of a named site; in Python also a site. Positions of anchors and ranges are wrong by chance, as
     its accuracy states; all its deviations 0: exact."""
-    estimator: Annotated[
-        "Callable[[], OwnEstimator] | None", Text(read_estimator, "FILE.py:CLASS"), Rule(check_estimator)
-    ] = None
+    estimator: EstimatorClass = None
     """Your own estimator instead of the method, a class with hear(observation): each tag makes one, and gives it one
     time difference after the other."""
     duration_s: Annotated[Positive | None, Option("duration")] = None

@@ -1,48 +1,40 @@
 """``skyless.replay``: turn a recording into fixes, judged against the truth if there is one."""
 
 from collections.abc import Callable, Iterator, Mapping
-from functools import partial
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import Any, Final
 
 import msgspec
 import numpy as np
 from msgspec.structs import replace
 
-from skyless.arguments import python_function, wrong
-from skyless.cli.api.fixes import Fixes, FixRecorder, MeasurementRecorder, Measurements, Result
+from skyless.arguments import python_function
+from skyless.cli.api.fixes import FixesResult, FixRecorder, MeasurementRecorder, Measurements
 from skyless.cli.common import cm, number
 from skyless.core.air.masterless_packets import Packet, PairTdoa, Point
 from skyless.core.arrays import Matrix
 from skyless.core.errors import ConfigurationError, SkylessError
-from skyless.core.fix import Fix
 from skyless.core.method_names import DEFAULT_METHOD
 from skyless.research.foreign.formats import Recording
 from skyless.research.foreign.formats import open_recording as open_foreign
-from skyless.research.replays.captures import CaptureReplay, ReplayReport, distances_of
+from skyless.research.replays.captures import NAMELESS, CaptureReplay, OnFix, OnMeasured, ReplayReport, distances_of
 from skyless.research.replays.options import ReplayOptions
 from skyless.research.replays.site import SiteReplay, TagReport, summary_of
 from skyless.run.recordings.recording import McapRecording, is_mcap
 from skyless.sim.evaluation.figures import FixSamples, Judged, axes_std_m, truth_at
 from skyless.site.file.load import site_of
 
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-    from pandas import DataFrame
-
 _WORTH_SHIFTING_S: Final = 0.05
 """Offsets of the truth's times up to this are due to the filter itself."""
 
 
-class ReplayResult(Result, frozen=True, eq=False, kw_only=True):
+class ReplayResult(FixesResult, frozen=True, eq=False, kw_only=True):
     """Result of a replay."""
 
     path: Path
     reports: dict[str, ReplayReport]
     """Figures of each tag, by its name."""
-    fixes: Fixes = FixRecorder(()).fixes()
-    """All fixes; ``truth_m`` is NaN where unknown."""
     samples: Mapping[str, FixSamples]
     """An even sample of the fixes of each tag."""
     judged: dict[str, Judged]
@@ -77,23 +69,9 @@ class ReplayResult(Result, frozen=True, eq=False, kw_only=True):
             raise SkylessError(f"{self.path} has {len(self.reports)} tags; reports has the figures of each")
         return next(iter(self.reports.values()))
 
-    def to_dataframe(self) -> "DataFrame":
-        """See ``Fixes.to_dataframe``."""
-        return self.fixes.to_dataframe()
-
-    def plot(self, tag: str | None = None) -> "Figure":
-        """Draw track, height, errors and stated σ over time, and error distributions of a tag, by default the first.
-
-        Raises:
-            SkylessError: there is no such tag.
-        """
-        from skyless.research.replays.plot import track_figure
-
-        name = self.tags[0] if tag is None else tag
-        if name not in self.reports:
-            raise wrong("tag", tag, f"one of {', '.join(self.tags)}")
-        report = self.reports[name]
-        return track_figure(self.track(name), f"{self.path.name}, {name} ({report.format}): {report.fixes} fixes")
+    def _heading(self, tag: str, _count: int) -> str:
+        report = self.reports[tag]
+        return f"{self.path.name}, {tag} ({report.format}): {report.fixes} fixes"
 
     def title(self) -> str:
         """Title of the replay."""
@@ -170,14 +148,8 @@ def _triple(values_m: tuple[float, float, float] | None) -> str:
     return "–" if values_m is None else ", ".join(f"{value:.3f}" for value in values_m) + " m"
 
 
-OnFix = Callable[[str, float, Fix], None]
-"""Called with the tag's name, the fix's time on the recording's scale (Unix time for skyless record), and the fix."""
-
 Begin = Callable[[tuple[str, ...], str], OnFix | None]
 """Called before a replay with the tags' names, and the method or the kind of measurements; returns the fixes' sink."""
-
-OnMeasured = Callable[[str, float, Packet | PairTdoa, bool], None]
-"""Called with the tag's name, a time, a measurement given to the estimator, and whether it was used."""
 
 
 def replay_recording(asked: ReplayOptions, begin: Begin, on_measured: OnMeasured | None = None) -> ReplayResult:
@@ -190,17 +162,15 @@ def replay_recording(asked: ReplayOptions, begin: Begin, on_measured: OnMeasured
 
 def _replay_capture(asked: ReplayOptions, begin: Begin, on_measured: OnMeasured | None) -> ReplayResult:
     run, path = CaptureReplay(asked), Path(asked.file)
-    write = begin(("tag",), run.measurements)
-    on_fix = None if write is None else lambda fix: write("tag", fix.time_s, fix)
-    report = run.run(on_fix, asked.progress, None if on_measured is None else partial(on_measured, "tag"))
+    report = run.run(begin((NAMELESS,), run.measurements), asked.progress, on_measured)
     asked.progress(1.0)
     summary = {**msgspec.to_builtins(report), "height_note": run.height_note}
     summary["anchor_distances_m"] = distances_of(path, report.format)
     return ReplayResult(
         path=path,
-        reports={"tag": report},
-        samples={"tag": run.samples},
-        judged={"tag": run.judged},
+        reports={NAMELESS: report},
+        samples={NAMELESS: run.samples},
+        judged={NAMELESS: run.judged},
         height_note=run.height_note,
         summary=summary,
     )
@@ -224,15 +194,14 @@ def _replay_site(asked: ReplayOptions, begin: Begin, on_measured: OnMeasured | N
         )
         found = recording.summary()
         span_s = max((found.end_s or 0.0) - (found.start_s or 0.0), 1e-9)
-        write = begin(tuple(run.tags), asked.method or DEFAULT_METHOD)
-        on_fix = None if write is None else lambda tag, made: write(tag, made.unix_s, made.fix)
+        on_fix = begin(tuple(run.tags), asked.method or DEFAULT_METHOD)
         reports = run.run(on_fix, lambda done_s: asked.progress(min(max(done_s / span_s, 0.0), 1.0)), on_measured)
     asked.progress(1.0)
     unfinished = f"{path} has no end: it was cut off, or is still being written; later fixes are missing"
     return ReplayResult(
         path=path,
         reports={report.tag: report for report in reports},
-        samples=run.samples,
+        samples={tag: replayed.samples for tag, replayed in run.tags.items()},
         judged={report.tag: run.judged(report.tag) for report in reports},
         warnings=() if found.finished else (unfinished,),
         height_note="from the site",

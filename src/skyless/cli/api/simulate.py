@@ -2,20 +2,20 @@
 
 import time
 from collections.abc import Callable, Iterator
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import msgspec
 from msgspec.structs import replace
 
 from skyless.arguments import python_function
-from skyless.cli.api.fixes import Fixes, FixRecorder, Result
+from skyless.cli.api.fixes import FixesResult, FixRecorder
 from skyless.cli.api.options import SimulateOptions
 from skyless.cli.common import cm
 from skyless.core.errors import SkylessError
 from skyless.core.method_names import FILTERS
 from skyless.core.site import Site
 from skyless.run.masterless.smoothing import OwnReceiver
-from skyless.sim.evaluation.fleet import FleetReport, JudgedFix, TagFleet, report
+from skyless.sim.evaluation.fleet import AnyFleet, FleetReport, JudgedFix, report
 from skyless.sim.evaluation.request import Conditions
 from skyless.sim.evaluation.scenarios import (
     Request,
@@ -29,20 +29,14 @@ from skyless.sim.evaluation.scenarios import (
 from skyless.sim.lab import ideal_lab_site, lab_site, paper_lab_site
 from skyless.site.file.load import site_of
 
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
-    from pandas import DataFrame
 
-
-class SimulationResult(Result, frozen=True, eq=False):
+class SimulationResult(FixesResult, frozen=True, eq=False):
     """Result of a simulation."""
 
     request: Request
     """The simulated conditions."""
     report: FleetReport
     """Figures over one fix per tag and superframe after ``settle_s``."""
-    fixes: Fixes
-    """All fixes, with the truth; ``fixes.judged`` marks those of the report."""
 
     @property
     def site(self) -> Site:
@@ -55,11 +49,6 @@ class SimulationResult(Result, frozen=True, eq=False):
         return self.request.room
 
     @property
-    def tags(self) -> tuple[str, ...]:
-        """Names of the tags."""
-        return self.fixes.tags
-
-    @property
     def summary(self) -> dict[str, Any]:
         """The object that ``skyless simulate --json`` writes, in SI units, without the version."""
         settings = {
@@ -68,20 +57,8 @@ class SimulationResult(Result, frozen=True, eq=False):
         }  # fmt: skip
         return {**msgspec.to_builtins(self.report), **msgspec.to_builtins(settings)}
 
-    def to_dataframe(self) -> "DataFrame":
-        """See ``Fixes.to_dataframe``."""
-        return self.fixes.to_dataframe()
-
-    def plot(self, tag: str | None = None) -> "Figure":
-        """Draw track, height, errors and stated σ over time, and error distributions of a tag, by default the first.
-
-        Raises:
-            SkylessError: there is no such tag.
-        """
-        from skyless.research.replays.plot import track_figure
-
-        rows = self.fixes.track(tag)
-        return track_figure(rows, f"{self.site.name}, {tag or self.tags[0]}, simulated: {len(rows)} fixes")
+    def _heading(self, tag: str, count: int) -> str:
+        return f"{self.site.name}, {tag}, simulated: {count} fixes"
 
     def title(self) -> str:
         """Title of the simulation."""
@@ -129,7 +106,7 @@ class Simulation:
         )
         check_can_be_simulated(site, asked.method)
         try:
-            self.fleet: TagFleet = fleet_of_any_size(self.request)
+            self.fleet: AnyFleet = fleet_of_any_size(self.request)
         except ValueError as error:
             raise SkylessError(str(error)) from None
 
@@ -168,7 +145,7 @@ def run_simulate(asked: SimulateOptions) -> SimulationResult:
         judged_before[made.tag] = judged
 
     found = simulation.run(on_fix)
-    return SimulationResult(simulation.request, found, recorder.fixes())
+    return SimulationResult(simulation.request, found, fixes=recorder.fixes())
 
 
 simulate = python_function(SimulateOptions, run_simulate)

@@ -13,6 +13,7 @@ from skyless.cli.api.fixes import Result, data_frame, figures
 from skyless.cli.api.options import StudyOptions
 from skyless.cli.common import cm
 from skyless.core.arrays import Vector
+from skyless.research.studies.picture import draw
 from skyless.research.studies.run import STUDIES, Parts
 from skyless.research.studies.run import run_study as rows_of_study
 from skyless.research.studies.runner import Plan, Row, plan_of
@@ -80,7 +81,7 @@ class StudyResult(Result, frozen=True, eq=False):
 
     def plot(self) -> "Figure":
         """Draw the picture that ``skyless study --plot`` writes."""
-        return STUDIES[self.name].draw(self.rows)
+        return draw(STUDIES[self.name], self.rows)
 
     def title(self) -> str:
         """Title of the study."""

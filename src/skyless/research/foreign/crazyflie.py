@@ -12,7 +12,7 @@ import re
 from binascii import Error as Base64Error
 from binascii import a2b_base64
 from collections import Counter
-from collections.abc import Container, Iterator
+from collections.abc import Container, Iterator, Sequence
 from io import BufferedIOBase
 from os import PathLike
 from struct import Struct as Binary
@@ -100,13 +100,8 @@ def read(stream: BufferedIOBase, drops: Drops) -> Iterator[PairTdoa]:
 
 def read_truth(path: str | PathLike[str], _listener: str | None) -> Truth | None:
     """Positions from motion capture or lighthouse in the log; None if it has none."""
-    found: dict[str, list[tuple[float, ...]]] = {name: [] for name in _TRUTHS}
-    names = ("x", "y", "z", "qx", "qy", "qz", "qw")
-    for event in _events(path, found):
-        if event.values.keys() >= {"x", "y", "z"}:
-            found[event.name].append((event.time_s, *(event.values[name] for name in names if name in event.values)))
-    for rows in found.values():
-        if rows and len(table := in_order(np.array(rows, dtype=np.float64))):
+    for table in _vectors(path, _TRUTHS, ("x", "y", "z", "qx", "qy", "qz", "qw")):
+        if len(table):
             return Truth(table[:, 0], table[:, 1:4], table[:, 4:8] if table.shape[1] == 8 else None)
     return None
 
@@ -114,6 +109,15 @@ def read_truth(path: str | PathLike[str], _listener: str | None) -> Truth | None
 def _events(path: str | PathLike[str], names: Container[str]) -> Iterator[_Event]:
     with open_source(path) as stream:
         yield from (event for event in _Log(stream, Counter()).events() if event.name in names)
+
+
+def _vectors(path: str | PathLike[str], kinds: Sequence[str], names: Sequence[str]) -> list[Array]:
+    """Rows of time and the named fields of each kind of event, of which those after x, y and z may be missing."""
+    found: dict[str, list[tuple[float, ...]]] = {kind: [] for kind in kinds}
+    for event in _events(path, found):
+        if event.values.keys() >= {"x", "y", "z"}:
+            found[event.name].append((event.time_s, *(event.values[name] for name in names if name in event.values)))
+    return [in_order(np.array(rows or np.empty((0, 4)), dtype=np.float64)) for rows in found.values()]
 
 
 def in_order(table: Array) -> Array:
@@ -131,11 +135,7 @@ def read_heights(path: str | PathLike[str], *, is_barometer: bool) -> Array | No
 
 def read_motion(path: str | PathLike[str]) -> Array | None:
     """Rows of time, rates [rad/s] and specific forces [m/s²], x, y and z each; None if the log lacks either."""
-    found: dict[str, list[tuple[float, ...]]] = {_GYROSCOPE: [], _ACCELEROMETER: []}
-    for event in _events(path, found):
-        if event.values.keys() >= {"x", "y", "z"}:
-            found[event.name].append((event.time_s, *(event.values[axis] for axis in "xyz")))
-    rates, forces = (in_order(np.array(rows, dtype=np.float64).reshape(-1, 4)) for rows in found.values())
+    rates, forces = _vectors(path, (_GYROSCOPE, _ACCELEROMETER), "xyz")
     if len(rates) == 0 or len(forces) == 0:
         return None
     together = [np.interp(rates[:, 0], forces[:, 0], GRAVITY_MPS2 * forces[:, axis]) for axis in (1, 2, 3)]

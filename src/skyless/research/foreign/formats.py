@@ -28,13 +28,12 @@ class Format:
     """A format: how to recognise and read it."""
 
     name: str
-    summary: str
     recognise: Callable[[bytes], bool]
     """From the first bytes, decompressed."""
     read: Callable[..., Iterator[Record]]
     """From an open stream and a counter of drops; with ``listener`` if ``any_listener``, and ``anchors_m`` if
     ``is_dl_tdoa``."""
-    tx_bits: int | None
+    tx_bits: int | None = None
     """Width of the anchors' stamps in its packets; None for a format of ready TDoAs."""
     any_listener: bool = False
     """One recording holds several listeners, one of which is chosen."""
@@ -64,94 +63,49 @@ _bitcraze: Final = partial(Format, tx_bits=bitcraze.STAMP_BITS, delays_ticks=bit
 _dl_tdoa: Final = partial(Format, tx_bits=TICK_BITS, is_dl_tdoa=True)
 
 FORMATS: Final = (
-    _bitcraze(
-        "bitcraze-yaml",
-        "Bitcraze sniffer, YAML documents with base64 payloads (TDoA2, TDoA3)",
-        crazyflie.recognise_yaml,
-        crazyflie.read_yaml,
-    ),
-    _bitcraze(
-        "bitcraze-text",
-        "Bitcraze sniffer, text lines 'From .. to .. @..: ..' (TDoA2, TDoA3)",
-        bitcraze.recognise_text,
-        bitcraze.read_text,
-    ),
+    _bitcraze("bitcraze-yaml", crazyflie.recognise_yaml, crazyflie.read_yaml),
+    _bitcraze("bitcraze-text", bitcraze.recognise_text, bitcraze.read_text),
     Format(
         "miluv",
-        "MILUV passive ticks: three-message exchanges overheard by a listener",
         partial(has_columns, datasets.MILUV_COLUMNS),
         datasets.read_miluv,
-        None,
         any_listener=True,
         read_truth=read_truth,
     ),
     Format(
-        "avalue",
-        "Avalue anchors' receptions of each other (ccp.csv); one of them plays the tag",
-        partial(has_columns, datasets.RECEPTION_COLUMNS),
-        datasets.read_avalue,
-        TICK_BITS,
-        any_listener=True,
+        "avalue", partial(has_columns, datasets.RECEPTION_COLUMNS), datasets.read_avalue, TICK_BITS, any_listener=True
     ),
-    _dl_tdoa(
-        "dl-tdoa-json",
-        "FiRa DL-TDoA records of phones, lines of JSON (iOS NIDLTDOAMeasurement, Android DlTdoaMeasurement)",
-        phones.recognise,
-        phones.read,
-    ),
-    _dl_tdoa(
-        "uci-text",
-        "FiRa UCI log, lines with hexadecimal packets (DL-TDoA measurements, versions 1 and 2)",
-        fira.recognise_text,
-        fira.read_text,
-    ),
-    Format(
-        "tdoa-table",
-        "Table t_s,anchor_a,anchor_b,tdoa_m, or with idA and idB",
-        datasets.recognise_tdoas,
-        datasets.read_tdoas,
-        None,
-    ),
+    _dl_tdoa("dl-tdoa-json", phones.recognise, phones.read),
+    _dl_tdoa("uci-text", fira.recognise_text, fira.read_text),
+    Format("tdoa-table", datasets.recognise_tdoas, datasets.read_tdoas),
     Format(
         "util-table",
-        "UTIL's published tables t_tdoa,idA,idB,tdoa_meas, with poses, ranger and barometer",
         partial(has_columns, datasets.UTIL_COLUMNS),
         partial(datasets.read_tdoas, columns=datasets.UTIL_COLUMNS),
-        None,
         read_truth=datasets.read_util_truth,
         truth_is_of_body=True,
         read_heights=datasets.read_util_heights,
     ),
     Format(
         "crazyflie-log",
-        "Log of a Crazyflie's SD card (events estTDOA or estTdoaCand, poses, lighthouse, ranger, barometer, IMU)",
         crazyflie.recognise,
         crazyflie.read,
-        None,
         read_truth=crazyflie.read_truth,
         truth_is_of_body=True,
         read_heights=crazyflie.read_heights,
         read_motion=crazyflie.read_motion,
     ),
-    _dl_tdoa(
-        "uci-pcapng",
-        "FiRa UCI capture, pcapng of link type 299 (DL-TDoA measurements, versions 1 and 2)",
-        fira.recognise_pcapng,
-        fira.read_pcapng,
-    ),
+    _dl_tdoa("uci-pcapng", fira.recognise_pcapng, fira.read_pcapng),
     Format(
         "starloc",
-        "STARLOC's two-way exchanges of a tag with anchors (uwb.csv), as differences of successive ranges",
         partial(has_columns, datasets.COLUMNS),
         datasets.read_starloc,
-        None,
         any_listener=True,
         read_truth=datasets.starloc_truth,
         read_anchors=datasets.starloc_anchors,
     ),
     Format(
         "muloc",
-        "MULoc's arrays (npz): four anchors that hear each other and a tag, with anchors and truth",
         datasets.recognise,
         datasets.read_muloc,
         TICK_BITS,
@@ -159,18 +113,8 @@ FORMATS: Final = (
         read_anchors=datasets.muloc_anchors,
         channels=datasets.CHANNELS,
     ),
-    _bitcraze(
-        "bitcraze-binary",
-        "Bitcraze sniffer, binary records BC .. (TDoA2, TDoA3)",
-        bitcraze.recognise_binary,
-        bitcraze.read_binary,
-    ),
-    _dl_tdoa(
-        "uci-binary",
-        "FiRa UCI log, packets as they came over the line (DL-TDoA measurements, versions 1 and 2)",
-        fira.recognise_binary,
-        fira.read_binary,
-    ),
+    _bitcraze("bitcraze-binary", bitcraze.recognise_binary, bitcraze.read_binary),
+    _dl_tdoa("uci-binary", fira.recognise_binary, fira.read_binary),
 )
 """In the order of recognition: the more specific first."""
 

@@ -15,6 +15,7 @@ import msgspec
 import numpy as np
 from msgspec import Struct, structs
 from msgspec.structs import replace
+from scipy.stats import norm
 
 from skyless.core.arrays import Array, Integers
 from skyless.core.geometry import dops_at
@@ -46,7 +47,6 @@ from skyless.research.paper.plan import (
     Verdict,
     draw_lambdas,
     draw_moments,
-    gaussian,
     grouped,
     listen,
     receptions,
@@ -480,7 +480,9 @@ def _density(one: LambdaDistribution) -> Panel:
         ("printed", one.printed_std_m, {"color": RED, "linestyle": "--"}),
     ):
         if std_m is not None:
-            lines.append((x_mm, gaussian(x_mm, 1e3 * std_m), {**style, "label": f"{name}, σ = {1e3 * std_m:.2f} mm"}))
+            lines.append(
+                (x_mm, norm.pdf(x_mm, 0.0, 1e3 * std_m), {**style, "label": f"{name}, σ = {1e3 * std_m:.2f} mm"})
+            )
     caption = f"Error of one DTDoA, {one.noise} stamps, and the densities that theory gives."
     axis = {"xlabel": "error of one DTDoA in mm", "ylabel": "density in 1/mm"}
     return _plot(f"03-lambda-{one.noise}", f"λ with {one.noise} stamps", caption, lines, axis)
@@ -642,7 +644,7 @@ def _histogram(point: str, axis: str, error_cm: Array) -> Panel:
     label = f"mean {error_cm.mean():+.2f}, σ {error_cm.std():.2f} cm".replace("-", "−")
     lines: list[Line] = [
         (x_cm, density, {"color": METHOD_COLOURS["literal"], "drawstyle": "steps-mid"}),
-        (x_cm, gaussian(x_cm, error_cm.std(), error_cm.mean()), {"color": INK, "label": label}),
+        (x_cm, norm.pdf(x_cm, error_cm.mean(), error_cm.std()), {"color": INK, "label": label}),
     ]
     caption = f"Errors of literal along {axis.upper()} at {point}, stamp noise only; line: a Gaussian."
     along = {"xlabel": f"error along {axis.upper()} in cm", "ylabel": "density in 1/cm"}

@@ -152,12 +152,6 @@ class Found(NamedTuple):
     numbers: dict[str, object]
 
 
-def gaussian(values: Array, std: float, mean: float = 0.0) -> Array:
-    """Density of a Gaussian at some values."""
-    density: Array = np.exp(-0.5 * ((values - mean) / std) ** 2) / (std * np.sqrt(2.0 * np.pi))
-    return density
-
-
 def grouped(count: int) -> str:
     """A whole number with thousands separated."""
     return f"{count:,}".replace(",", "\u00a0")
@@ -432,7 +426,7 @@ def listen(
     seed: int,
     until_s: float | None = None,
 ) -> list[dict[str, Track]]:
-    """Run a world until every method of every tag has its fixes, or until ``until_s``.
+    """Run a world for so long that every method of every tag can have its fixes, or until ``until_s``.
 
     ``tags``: how each moves, the methods with which it computes, and how many fixes each of them makes.
 
@@ -450,24 +444,20 @@ def listen(
     ]
     most_fixes = max(most for _, methods in tags for most in methods.values())
     end_s = until_s if until_s is not None else _WARMUP_S + 1.02 * most_fixes * superframe_s + 1.0
-    now_s = 0.0
-    while now_s < end_s and any(len(rows) < most for own in listeners for *_, rows, most in own):
-        now_s = min(now_s + 0.5, end_s)
-        for broadcast in world.run(now_s):
-            for tag, reception, truth_m in broadcast.receptions():
-                for receiver, first_fixes, rows, most in listeners[tag]:
-                    at_s, fix = broadcast.end_s, receiver.hear(reception) if len(rows) < most else None
-                    if fix is not None and at_s >= _WARMUP_S and first_fixes.is_first(0, at_s):
-                        rows.append((at_s, *fix.position_m[:2].tolist(), *truth_m[:2].tolist()))
+    for broadcast in world.run(end_s):
+        for tag, reception, truth_m in broadcast.receptions():
+            for receiver, first_fixes, rows, most in listeners[tag]:
+                at_s, fix = broadcast.end_s, receiver.hear(reception) if len(rows) < most else None
+                if fix is not None and at_s >= _WARMUP_S and first_fixes.is_first(0, at_s):
+                    rows.append((at_s, *fix.position_m[:2].tolist(), *truth_m[:2].tolist()))
     return [
-        {method: _track(rows) for method, (_, _, rows, _) in zip(methods, own, strict=True)}
+        {
+            method: Track(columns[:, 0], columns[:, 1:3], columns[:, 3:])
+            for method, (_, _, rows, _) in zip(methods, own, strict=True)
+            for columns in [np.array(rows).reshape(-1, 5)]
+        }
         for (_, methods), own in zip(tags, listeners, strict=True)
     ]
-
-
-def _track(rows: list[tuple[float, ...]]) -> Track:
-    columns = np.array(rows).reshape(-1, 5)
-    return Track(columns[:, 0], columns[:, 1:3], columns[:, 3:])
 
 
 class TimedReception(Struct, frozen=True):

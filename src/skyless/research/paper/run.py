@@ -4,7 +4,7 @@ import tempfile
 from collections.abc import Callable
 from operator import methodcaller
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import msgspec
 from msgspec import Struct
@@ -15,6 +15,9 @@ from skyless.research.paper.claims import CLAIMS
 from skyless.research.paper.plan import Plan, Section, report_page
 from skyless.research.studies.runner import run_cells
 from skyless.site.report import picture, report_style
+
+_PRINTED: Final = ("key", "title", "label", "verdict", "reason", "numbers", "command")
+"""Fields of a section that are in the report's numbers."""
 
 
 class Report(Struct, frozen=True):
@@ -69,15 +72,12 @@ def _written(plan: Plan, sections: list[Section], results: dict[str, Any], out: 
         report=str(out / "report.html"),
         figures=tuple(map(str, files)),
         checks=tuple(msgspec.to_builtins(check) for check in results["checks"]),
-        sections=tuple(_as_fields(section) for section in sections),
+        sections=tuple(
+            {name: getattr(section, name) for name in _PRINTED} | {"pictures": [one.name for one in section.panels]}
+            for section in sections
+        ),
     )
     numbers = msgspec.json.format(msgspec.json.encode(report, enc_hook=methodcaller("tolist")), indent=1)
     page = report_page(command, sections, pictures, quick=plan.quick)
     replace_files({**files, out / "numbers.json": numbers, out / "report.html": page.encode()})
     return report
-
-
-def _as_fields(section: Section) -> dict[str, object]:
-    """A section without its texts and figures."""
-    names = ("key", "title", "label", "verdict", "reason", "numbers", "command")
-    return {name: getattr(section, name) for name in names} | {"pictures": [panel.name for panel in section.panels]}

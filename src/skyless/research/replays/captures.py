@@ -501,6 +501,16 @@ def common_figures(
     }
 
 
+OnFix = Callable[[str, float, Fix], None]
+"""Called with the tag's name, the fix's time on the recording's scale (Unix time for skyless record), and the fix."""
+
+OnMeasured = Callable[[str, float, Record, bool], None]
+"""Called with the tag's name, a time, a measurement given to the estimator, and whether it was used."""
+
+NAMELESS: Final = "tag"
+"""Name of the tag of a recording that has one tag without a name."""
+
+
 class CaptureReplay:
     """Replays one recording of another system through the filter."""
 
@@ -610,14 +620,13 @@ class CaptureReplay:
 
     def run(
         self,
-        on_fix: Callable[[Fix], None] | None,
+        on_fix: OnFix | None,
         on_progress: Callable[[float], None],
-        on_measured: Callable[[float, Record, bool], None] | None = None,
+        on_measured: OnMeasured | None = None,
     ) -> ReplayReport:
         """Read to the end.
 
-        ``on_fix`` gets every fix, ``on_progress`` now and then the share that is done, and ``on_measured`` the parts of
-        ``Measured``.
+        ``on_progress`` gets now and then the share that is done, and ``on_measured`` the parts of ``Measured``.
         """
         started_s, size = time.perf_counter(), max(Path(self._asked.file).stat().st_size, 1)
         reading = READING_SHARE if self._asked.smooth else 1.0
@@ -650,10 +659,10 @@ class CaptureReplay:
         figures = figures_of(table, self.judged, self.samples.count)
         return self._report(figures, offset_s, time.perf_counter() - started_s)
 
-    def _tell(self, on_measured: Callable[[float, Record, bool], None] | None) -> None:
+    def _tell(self, on_measured: OnMeasured | None) -> None:
         if on_measured is not None:
             for measured in self._pipeline.measured:
-                on_measured(*measured)
+                on_measured(NAMELESS, *measured)
 
     def _is_over(self) -> bool:
         """Whether as much has been replayed as was asked for."""
@@ -673,10 +682,10 @@ class CaptureReplay:
             above_m=flight_height(asked.above_m, self._truth),
         )
 
-    def _add(self, fix: Fix, on_fix: Callable[[Fix], None] | None) -> None:
+    def _add(self, fix: Fix, on_fix: OnFix | None) -> None:
         self.samples.add(fix.time_s, fix)
         if on_fix is not None:
-            on_fix(fix)
+            on_fix(NAMELESS, fix.time_s, fix)
 
     def _check_truth(self, table: FixTable) -> None:
         """Check that the listener is in the recording, and that the truth overlaps it. Raises SkylessError."""

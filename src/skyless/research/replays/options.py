@@ -10,6 +10,7 @@ from skyless.arguments import (
     Method,
     NotNegative,
     Option,
+    Options,
     Positive,
     Rule,
     Text,
@@ -76,6 +77,14 @@ def _check_bounds(name: str, value: Any) -> tuple[float, float]:  # noqa: ANN401
     return low_m, high_m
 
 
+LeverArm = Annotated[
+    "tuple[float, float, float] | None",
+    Option("lever-arm"),
+    numbers(3, form="x,y,z"),
+    point(3, farthest_m=MAX_COORDINATE_M),
+]
+
+
 class RecordingOptions(ComputedOptions, frozen=True):
     """A recording, and what is known of it."""
 
@@ -89,12 +98,7 @@ class RecordingOptions(ComputedOptions, frozen=True):
     Unix time for a recording of skyless record; in Python also an array of shape (n, 4). MILUV ticks bring theirs."""
     truth_offset_s: Annotated[float | str, Option("truth-offset"), Text(_read_offset), Rule(_check_offset)] = 0.0
     """Seconds to add to the truth's times; auto: what fits the fixes best."""
-    lever_arm_m: Annotated[
-        "tuple[float, float, float] | None",
-        Option("lever-arm"),
-        numbers(3, form="x,y,z"),
-        point(3, farthest_m=MAX_COORDINATE_M),
-    ] = None
+    lever_arm_m: LeverArm = None
     """The antenna in the body's frame, in metres, added to the truth."""
     format: str | None = None
     """Name of the format, if the content should not decide."""
@@ -127,6 +131,11 @@ def check_estimator(name: str, value: Any) -> Any:  # noqa: ANN401 - any class
     return value
 
 
+EstimatorClass = Annotated[
+    "Callable[[], OwnEstimator] | None", Text(read_estimator, "FILE.py:CLASS"), Rule(check_estimator)
+]
+
+
 class ReplayOptions(RecordingOptions, frozen=True, kw_only=True):
     """Options of ``skyless replay``."""
 
@@ -155,9 +164,7 @@ class ReplayOptions(RecordingOptions, frozen=True, kw_only=True):
     smooth: bool = False
     """Let every fix use all of the recording, what came later as well (of time differences); fixes have no protection
     level then."""
-    estimator: Annotated[
-        "Callable[[], OwnEstimator] | None", Text(read_estimator, "FILE.py:CLASS"), Rule(check_estimator)
-    ] = None
+    estimator: EstimatorClass = None
     """Your own estimator instead of the filter: a class with hear(observation), which gets one time difference after
     the other."""
     first_s: Annotated[Positive | None, Option("only-first")] = None
@@ -208,3 +215,42 @@ class ReplayOptions(RecordingOptions, frozen=True, kw_only=True):
         if not asked.given("integrity_risk", "alert_limit_m") and self.tag_height_std_m is None:
             return None
         return asked.requirement(self.method, self.tag_height_std_m)
+
+
+_QUICK_S: Final = 12.0
+
+
+class BenchmarkOptions(Options, frozen=True, kw_only=True):
+    """Options of ``skyless benchmark``."""
+
+    out: Path = Path("benchmark")
+    """Write the result here, into a folder: index.html, results.csv and results.json. What is there already is kept."""
+    only: str = ""
+    """Only recordings whose name holds this text."""
+    lever_arm_m: LeverArm = None
+    """The antenna in the body's frame, in metres, added to the truth of tables."""
+    calibrate_on: Annotated[tuple[str, ...], Option("calibrate-on"), Text(lambda _, text: text, "NAME", many=True)] = ()
+    """Calibrate anchors on recordings whose names hold this text, for each table of anchors on the first; others with
+    the same table are replayed with that as well."""
+    estimator: EstimatorClass = None
+    """Your own estimator as one more method: a class with hear(observation)."""
+    first_s: Annotated[Positive | None, Option("only-first")] = None
+    """Replay only this number of seconds of each recording."""
+    quick: bool = False
+    """Compute a fraction: the first twelve seconds of each recording, without smoothing; about a minute for thirty."""
+
+    @property
+    def seconds(self) -> float | None:
+        """How much of each recording is replayed; None for all."""
+        return _QUICK_S if self.quick and self.first_s is None else self.first_s
+
+    @property
+    def estimators(self) -> "dict[str, Callable[[], OwnEstimator]]":
+        """The own estimator, if there is one, by the name of its class."""
+        return {} if self.estimator is None else {getattr(self.estimator, "__name__", "own"): self.estimator}
+
+    @property
+    def program(self) -> Path | None:
+        """The file of the own estimator."""
+        code = getattr(getattr(self.estimator, "hear", self.estimator), "__code__", None)
+        return None if code is None else Path(code.co_filename)

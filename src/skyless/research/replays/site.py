@@ -2,8 +2,7 @@
 
 import time
 from collections import Counter, defaultdict
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from functools import partial
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, Final, cast
 
 import msgspec
@@ -23,7 +22,7 @@ from skyless.core.site import Site
 from skyless.core.tag.receiver import NOT_DROPS
 from skyless.core.ticks import WRAP_TICKS, wrap
 from skyless.files import Drops
-from skyless.research.replays.captures import ReplayReport, common_figures
+from skyless.research.replays.captures import OnFix, OnMeasured, ReplayReport, common_figures
 from skyless.run.mqtt.messages import RawReception, ReceptionsMessage, SegmentStart
 from skyless.run.recordings.reception_log import receiver_of
 from skyless.run.recordings.recording import HostClock, McapRecording, tags_to_replay
@@ -96,14 +95,6 @@ class _Heard(Struct, frozen=True):
     fix: Fix | None
 
 
-class Replayed(Struct, frozen=True):
-    """A replayed fix."""
-
-    fix: Fix
-    unix_s: float
-    """End of its last frame, without the host's delays."""
-
-
 class TagReplay:
     """Processes the receptions of one tag in the order of the recording; each segment begins with a new receiver."""
 
@@ -124,9 +115,14 @@ class TagReplay:
         self.tag = tag
         self.method = method
         """As recorded, once known, or as requested."""
-        self.receptions = self.fixes = self.segments = 0
+        self.receptions = self.segments = 0
         self.begun_s: float | None = None
         """Unix time of the first reception."""
+        self.samples = FixSamples()
+        self.span_s = (0.0, 0.0)
+        """First and last fix, Unix time."""
+        self.anchors: Counter[int] = Counter()
+        """How many fixes are of that many anchors."""
         self.drops: Drops = Counter()
         self.reason = "no-beacons"
         """The last reason for no fix."""
@@ -137,15 +133,17 @@ class TagReplay:
         self._segment = ""
         self._next = 0
         self._clock: HostClock[_Heard] = HostClock()
-        self.on_measured: Callable[[float, Packet, bool], None] | None = None
-        """Gets the Unix time of each beacon, the beacon as a packet without relays, and whether it made a fix."""
+        self.on_fix: OnFix | None = None
+        """Gets each fix, with the end of its last frame, without the host's delays."""
+        self.on_measured: OnMeasured | None = None
+        """Gets each beacon as a packet without relays, and whether it made a fix."""
 
-    def process(self, message: ReceptionsMessage) -> Iterator[Replayed]:
-        """Process a run of receptions. Yields the fixes that they, or earlier runs, make."""
+    def process(self, message: ReceptionsMessage) -> None:
+        """Process a run of receptions, which gives the fixes that they, or earlier runs, make."""
         clock = self._clock
         fresh = self._unheard(message)
         if self._clock is not clock:
-            yield from self._timed(clock.rest())
+            self._tell(clock.rest())
         for raw in fresh:
             reception = reception_of(raw)
             if reception is None:
@@ -158,25 +156,28 @@ class TagReplay:
                 reception = structs.replace(reception, carrier_phase_cycles=None)
             assert self._receiver is not None
             fix = self._receiver.hear(reception)
-            self.fixes += fix is not None
             self.reason = str(self._receiver.reason)
-            yield from self._timed(self._clock.add(reception, message.unix_less_host_s, _Heard(reception, fix)))
+            self._tell(self._clock.add(reception, message.unix_less_host_s, _Heard(reception, fix)))
 
-    def rest(self) -> Iterator[Replayed]:
-        """The last fixes, at the end of the recording."""
-        yield from self._timed(self._clock.rest())
+    def finish(self) -> None:
+        """Give the last fixes, at the end of the recording."""
+        self._tell(self._clock.rest())
 
-    def _timed(self, found: list[tuple[_Heard, float]]) -> Iterator[Replayed]:
-        """Fixes of receptions whose Unix time is now known."""
+    def _tell(self, found: list[tuple[_Heard, float]]) -> None:
+        """Count and give the fixes of receptions whose Unix time is now known."""
         for made, unix_s in found:
             self.begun_s = unix_s if self.begun_s is None else self.begun_s
             if self.on_measured is not None:
                 beacon, rx_ticks = decode_any(made.reception.frame), made.reception.rx_ticks
                 if not isinstance(beacon, Malformed):
                     packet = Packet(None, beacon.anchor, beacon.sequence, beacon.tx_ticks, rx_ticks, ())
-                    self.on_measured(unix_s, packet, made.fix is not None)
+                    self.on_measured(self.tag, unix_s, packet, made.fix is not None)
             if made.fix is not None:
-                yield Replayed(made.fix, unix_s)
+                self.span_s = (self.span_s[0] if self.samples.count else unix_s, unix_s)
+                self.anchors[len(made.fix.anchors)] += 1
+                self.samples.add(unix_s, made.fix)
+                if self.on_fix is not None:
+                    self.on_fix(self.tag, unix_s, made.fix)
 
     def all_drops(self) -> dict[str, int]:
         """What could not be used, by reason, including the receiver's own."""
@@ -274,77 +275,54 @@ class SiteReplay:
         if wanted is not None:
             delays = delay_changes(recorded_site(recording, wanted.id), wanted)
         self.tags = {tag: TagReplay(tag, method, delays, integrity, stamps_only) for tag in tags or summary.raw_tags}
-        self.samples = {tag: FixSamples() for tag in self.tags}
-        self._spans: dict[str, tuple[float, float]] = {}
-        """First and last fix of each tag, Unix time."""
-        self._anchors: dict[str, Counter[int]] = {tag: Counter() for tag in self.tags}
-        """How many fixes of each tag are of that many anchors."""
 
     def run(
         self,
-        on_fix: Callable[[str, Replayed], None] | None,
+        on_fix: OnFix | None,
         on_progress: Callable[[float], None],
-        on_measured: Callable[[str, float, Packet, bool], None] | None = None,
+        on_measured: OnMeasured | None = None,
     ) -> list[TagReport]:
-        """Replay all; ``on_progress`` gets now and then the recording's seconds done so far.
-
-        ``on_measured`` gets the tag's name and what ``TagReplay.on_measured`` gets.
-        """
+        """Replay all; ``on_progress`` gets now and then the recording's seconds done so far."""
         begun_s = time.perf_counter()
-        if on_measured is not None:
-            for tag, replay in self.tags.items():
-                replay.on_measured = partial(on_measured, tag)
+        for replay in self.tags.values():
+            replay.on_fix, replay.on_measured = on_fix, on_measured
         for number, found in enumerate(self._recording.messages({"receptions"})):
             if (heard := self.tags.get(found.channel.name)) is not None:
-                self._add(heard, heard.process(cast("ReceptionsMessage", found.message)), on_fix)
+                heard.process(cast("ReceptionsMessage", found.message))
             if number % 256 == 0:
                 on_progress(found.time_s - self._begin_s)
         for replay in self.tags.values():
-            self._add(replay, replay.rest(), on_fix)
+            replay.finish()
         wall_s = time.perf_counter() - begun_s
         return [self._report(tag, wall_s) for tag in self.tags]
 
-    def _add(
-        self, replay: TagReplay, fixes: Iterable[Replayed], on_fix: Callable[[str, Replayed], None] | None
-    ) -> None:
-        tag = replay.tag
-        for made in fixes:
-            first_s, _ = self._spans.get(tag, (made.unix_s, 0.0))
-            self._spans[tag] = (first_s, made.unix_s)
-            self._anchors[tag][len(made.fix.anchors)] += 1
-            self.samples[tag].add(made.unix_s, made.fix)
-            if on_fix is not None:
-                on_fix(tag, made)
-
     def judged(self, tag: str) -> Judged:
         """Which fixes of a tag are judged."""
-        replay, (_, last_s) = self.tags[tag], self._spans.get(tag, (0.0, 0.0))
+        replay = self.tags[tag]
         return Judged(
             truth=self._truth.get(tag),
             begin_s=replay.begun_s,
-            end_s=last_s,
+            end_s=replay.span_s[1],
             planar=self.height_m is not None,
             settle_s=self._settle_s,
             above_m=self._above_m,
         )
 
     def _report(self, tag: str, wall_s: float) -> TagReport:
-        replay, anchors, samples = self.tags[tag], self._anchors[tag], self.samples[tag]
-        figures = figures_of(samples.table(), self.judged(tag), samples.count)
-        first_s, last_s = self._spans.get(tag, (0.0, 0.0))
+        replay = self.tags[tag]
+        fixes, (first_s, last_s) = replay.samples.count, replay.span_s
+        figures = figures_of(replay.samples.table(), self.judged(tag), fixes)
         return TagReport(
             format=SITE_FORMAT,
-            **common_figures(figures, replay.receptions, replay.fixes, replay.all_drops(), wall_s),
-            rate_hz=replay.fixes / (last_s - first_s) if last_s > first_s else None,
+            **common_figures(figures, replay.receptions, fixes, replay.all_drops(), wall_s),
+            rate_hz=fixes / (last_s - first_s) if last_s > first_s else None,
             height_m=self.height_m,
-            reason=None if replay.fixes else replay.reason,
+            reason=None if fixes else replay.reason,
             tag=tag,
             method=replay.method,
             segments=replay.segments,
-            mean_anchors=sum(count * fixes for count, fixes in anchors.items()) / replay.fixes
-            if replay.fixes
-            else None,
-            most_anchors=max(anchors, default=0),
+            mean_anchors=sum(count * number for count, number in replay.anchors.items()) / fixes if fixes else None,
+            most_anchors=max(replay.anchors, default=0),
         )
 
 

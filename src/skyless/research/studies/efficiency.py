@@ -4,13 +4,13 @@ Each episode lasts two seconds; errors count after each of its last 20 superfram
 assumes the very noise that the episodes have. The bound is that of the receptions that the tag knew of by then.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any, Final
 
 import numpy as np
 from msgspec import Struct
-from numpy.random import Generator
+from numpy.random import Generator, SeedSequence, default_rng
 from scipy.stats import chi2
 
 from skyless.core.arrays import Array, Integers
@@ -19,7 +19,7 @@ from skyless.core.estimator.estimator import Estimator, Packets
 from skyless.core.estimator.settings import EstimatorSettings
 from skyless.core.geometry import anchor_positions
 from skyless.core.ticks import SPEED_OF_LIGHT_MPS, TICK_M
-from skyless.research.studies.runner import Cell, Limit, Plan, Row, with_limits
+from skyless.research.studies.runner import Cell, Limit, Plan, Row, of_cases, with_limits
 from skyless.research.uncertainty import BoundSettings, tracking_bound
 from skyless.sim.lab import paper_lab_site
 
@@ -173,12 +173,12 @@ EFFICIENCY_CASES: Final = tuple(
 )
 
 
-def run_chunk(case: Case, seeds: list[np.random.SeedSequence]) -> Array:
+def run_chunk(case: Case, seeds: list[SeedSequence]) -> Array:
     """One row for each episode: squared error, the filter's variance and the bound in m², and its last NEES."""
-    return np.array([_run(case, np.random.default_rng(seed)) for seed in seeds])
+    return np.array([_run(case, default_rng(seed)) for seed in seeds])
 
 
-def _run(case: Case, draw: np.random.Generator) -> list[float]:
+def _run(case: Case, draw: Generator) -> list[float]:
     site = paper_lab_site()
     anchors = anchor_positions(site)
     episode = draw_episode(draw, anchors, site.schedule.slot_s, case)
@@ -187,10 +187,21 @@ def _run(case: Case, draw: np.random.Generator) -> list[float]:
     ends = np.arange(len(anchors) - 1, len(rows), len(anchors))[-_JUDGED_SUPERFRAMES:]
     errors = rows["position_m"][ends, :2] - episode.path_m[ends, :2]
     covariances = rows["covariance_m2"][ends, :2, :2]
+    schedule = BoundSettings(
+        case.noise_ps * 1e-12,
+        white_fm=WHITE_FM,
+        random_walk_fm=case.random_walk_fm,
+        qa=case.qa,
+        slot_s=site.schedule.slot_s,
+        speed_std_mps=EPISODE_SPEED_STD_MPS,
+        mesh=case.mesh,
+        at_once=case.at_once,
+    )
+    bound = tracking_bound(anchors, episode.path_m, schedule)[-_JUDGED_SUPERFRAMES:]
     return [
         float(np.square(errors).sum(axis=1).mean()),
         float(np.trace(covariances, axis1=1, axis2=2).mean()),
-        _bound(case, anchors, episode, site.schedule.slot_s),
+        float(np.trace(bound, axis1=1, axis2=2).mean()),
         float(errors[-1] @ np.linalg.solve(covariances[-1], errors[-1])),
     ]
 
@@ -205,44 +216,29 @@ def tracked(
     return estimator.track(packets, has_levels=has_levels)
 
 
-def _bound(case: Case, anchors: Array, episode: Episode, slot_s: float) -> float:
-    settings = BoundSettings(
-        case.noise_ps * 1e-12,
-        white_fm=WHITE_FM,
-        random_walk_fm=case.random_walk_fm,
-        qa=case.qa,
-        slot_s=slot_s,
-        speed_std_mps=EPISODE_SPEED_STD_MPS,
-        mesh=case.mesh,
-        at_once=case.at_once,
-    )
-    bound = tracking_bound(anchors, episode.path_m, settings)[-_JUDGED_SUPERFRAMES:]
-    return float(np.trace(bound, axis1=1, axis2=2).mean())
-
-
 def cells(plan: Plan) -> list[Cell]:
     """Episodes in chunks. Raises SkylessError if the method is not one that can be fed with an episode's stamps."""
     if plan.method != "joint":
         raise SkylessError(f"--method is {plan.method!r}; the study efficiency is about joint, whose bound it computes")
     return [
-        Cell(
-            _name(case),
-            partial(run_chunk, case, seeds[first : first + _CHUNK_EPISODES]),
-            _EPISODE_COST_S * _CHUNK_EPISODES,
-        )
+        cell
         for case in EFFICIENCY_CASES
-        for seeds in [np.random.SeedSequence(plan.seed).spawn(plan.episodes)]
-        for first in range(0, plan.episodes, _CHUNK_EPISODES)
+        for cell in episode_cells(_name(case), partial(run_chunk, case), SeedSequence(plan.seed), plan, _EPISODE_COST_S)
     ]
 
 
-def rows(plan: Plan, results: Sequence[Any]) -> list[Row]:
+def episode_cells(
+    name: str, run: Callable[[list[SeedSequence]], Any], seed: SeedSequence, plan: Plan, cost_s: float
+) -> list[Cell]:
+    """The episodes of a case in chunks; ``run`` gets a chunk's seeds, ``cost_s`` is the CPU time of an episode."""
+    seeds = seed.spawn(plan.episodes)
+    chunks = (seeds[first : first + _CHUNK_EPISODES] for first in range(0, plan.episodes, _CHUNK_EPISODES))
+    return [Cell(name, partial(run, chunk), cost_s * len(chunk)) for chunk in chunks]
+
+
+def rows(_plan: Plan, results: Sequence[Any]) -> list[Row]:
     """A row for each case; the results stand in the order of ``cells``."""
-    each = -(-plan.episodes // _CHUNK_EPISODES)
-    return [
-        row_of(case, np.concatenate(results[each * number : each * (number + 1)]))
-        for number, case in enumerate(EFFICIENCY_CASES)
-    ]
+    return [row_of(case, np.concatenate(own)) for case, own in of_cases(EFFICIENCY_CASES, results)]
 
 
 def row_of(case: Case, rows: Array) -> Row:

@@ -23,23 +23,22 @@ from skyless.core.geometry import anchor_positions
 from skyless.core.integrity import CONTRADICTED, HPL, VPL
 from skyless.core.ticks import TICK_M
 from skyless.research.studies.efficiency import (
-    EPISODE_SUPERFRAMES,
     START_STD_M,
     Case,
     Episode,
     draw_episode,
+    episode_cells,
     settings_of,
     tracked,
 )
 from skyless.research.studies.picture import clustered_interval
-from skyless.research.studies.runner import Cell, Limit, Plan, Row, with_limits
+from skyless.research.studies.runner import Cell, Limit, Plan, Row, of_cases, with_limits
 from skyless.sim.evaluation.scenarios import ROOM_QA_M2PS3
 from skyless.sim.lab import paper_lab_site
 
 _ONSETS: Final = (40, 67)
 """Superframes between which the fault begins; the filter has settled long before."""
 
-_CHUNK_EPISODES: Final = 50
 _EPISODE_COST_S: Final = 0.008
 """Approximate CPU time of an episode."""
 
@@ -143,16 +142,6 @@ def _share(since_s: NDArray[np.floating[Any]], kind: Kind) -> Array:
     return np.where(on, -1.0 if kind == "early" else 1.0, 0.0)
 
 
-class Setting(Struct, frozen=True):
-    """What all episodes of a row have in common."""
-
-    case: Case
-    fault: Fault
-    risk: float
-    alert_limit_m: float | None = None
-    """Fixes with a higher level count as not available."""
-
-
 class Chunk(Struct, frozen=True):
     """Results of the episodes of a chunk."""
 
@@ -179,26 +168,22 @@ def cells(plan: Plan) -> list[Cell]:
     """Episodes in chunks. Raises SkylessError if the method gives no protection levels."""
     if plan.method != "joint":
         raise SkylessError(f"--method is {plan.method!r}; protection levels are given by joint")
-    case = Case(plan.noise_ps, qa=ROOM_QA_M2PS3, mesh=True)
-    seeds = SeedSequence(plan.seed).spawn(len(FAULTS))
-    found = []
-    for fault, seed in zip(FAULTS, seeds, strict=True):
-        setting = Setting(case, fault, plan.integrity_risk, plan.alert_limit_m)
-        own = tuple(seed.spawn(plan.episodes))
-        parts = [own[first : first + _CHUNK_EPISODES] for first in range(0, plan.episodes, _CHUNK_EPISODES)]
-        found += [Cell(fault.name, partial(run_chunk, setting, part), _EPISODE_COST_S * len(part)) for part in parts]
-    return found
+    return [
+        cell
+        for fault, seed in zip(FAULTS, SeedSequence(plan.seed).spawn(len(FAULTS)), strict=True)
+        for cell in episode_cells(fault.name, partial(run_chunk, plan, fault), seed, plan, _EPISODE_COST_S)
+    ]
 
 
-def run_chunk(setting: Setting, seeds: Sequence[SeedSequence]) -> Chunk:
+def run_chunk(plan: Plan, fault: Fault, seeds: Sequence[SeedSequence]) -> Chunk:
     """Run some episodes."""
-    episodes = [_run(setting, default_rng(seed)) for seed in seeds]
+    episodes = [_run(plan, fault, default_rng(seed)) for seed in seeds]
     counts = [
         (len(across), available.sum(), (available & (across > hpl)).sum(), (available & (above > vpl)).sum())
         for across, above, hpl, vpl, available in episodes
     ]
     across, _, hpl, vpl, available = (np.concatenate(part) for part in zip(*episodes, strict=True))
-    most = max(_MIN_LARGEST, int(10.0 * setting.risk * len(across)))
+    most = max(_MIN_LARGEST, int(10.0 * plan.integrity_risk * len(across)))
     return Chunk(
         counts=np.array(counts, float),
         squared_m2=float(across @ across),
@@ -208,31 +193,31 @@ def run_chunk(setting: Setting, seeds: Sequence[SeedSequence]) -> Chunk:
     )
 
 
-def _run(setting: Setting, draw: Generator) -> tuple[NDArray[Any], ...]:
+def _run(plan: Plan, fault: Fault, draw: Generator) -> tuple[NDArray[Any], ...]:
     """Horizontal and vertical errors, both levels, and whether they are available, of all fixes since the onset."""
-    anchors_m, slot_s = anchors_of(setting.fault.scene), paper_lab_site().schedule.slot_s
-    episode = draw_episode(draw, anchors_m, slot_s, setting.case, EPISODE_SUPERFRAMES)
+    anchors_m, slot_s = anchors_of(fault.scene), paper_lab_site().schedule.slot_s
+    case = Case(plan.noise_ps, qa=ROOM_QA_M2PS3, mesh=True)
+    episode = draw_episode(draw, anchors_m, slot_s, case)
     onset = int(draw.integers(*_ONSETS)) * len(anchors_m)
-    packets = faulty(episode, setting.fault, int(draw.integers(len(anchors_m))), onset, slot_s)
-    height_m = 0.0 if setting.fault.scene == "lab" else None
-    settings, dim = settings_of(setting.case, height_m).changed(integrity_risk=setting.risk), 3 - (height_m is not None)
+    packets = faulty(episode, fault, int(draw.integers(len(anchors_m))), onset, slot_s)
+    height_m = 0.0 if fault.scene == "lab" else None
+    settings, dim = settings_of(case, height_m).changed(integrity_risk=plan.integrity_risk), 3 - (height_m is not None)
     rows = tracked(settings, anchors_m, packets, episode.path_m[0] + draw.normal(0.0, START_STD_M, 3), has_levels=True)
     fixes = np.flatnonzero(np.isin(rows["outcome"][onset:], (ACCEPTED, JOINED))) + onset
     errors, given = np.zeros((len(fixes), 3)), rows["levels"][fixes]
     errors[:, :dim] = rows["position_m"][fixes, :dim] - episode.path_m[fixes, :dim]
     vpl = given[:, VPL] if dim == 3 else np.full(len(fixes), np.inf)
     available = rows["integrity"][fixes] < CONTRADICTED
-    if setting.alert_limit_m is not None:
-        available &= given[:, HPL] <= setting.alert_limit_m
+    if plan.alert_limit_m is not None:
+        available &= given[:, HPL] <= plan.alert_limit_m
     return np.hypot(errors[:, 0], errors[:, 1]), np.abs(errors[:, 2]), given[:, HPL], vpl, available
 
 
 def rows(plan: Plan, results: Sequence[Any]) -> list[IntegrityRow]:
     """A row for each fault, and one for all together; the results stand in the order of ``cells``."""
-    each = -(-plan.episodes // _CHUNK_EPISODES)
-    parts = [results[each * number : each * (number + 1)] for number in range(len(FAULTS))]
-    single = [_row(plan, fault, chunks) for fault, chunks in zip(FAULTS, parts, strict=True)]
-    wrong = [chunk for fault, chunks in zip(FAULTS, parts, strict=True) if fault.size_m > 0.0 for chunk in chunks]
+    of_faults = of_cases(FAULTS, results)
+    single = [_row(plan, fault, chunks) for fault, chunks in of_faults]
+    wrong = [chunk for fault, chunks in of_faults if fault.size_m > 0.0 for chunk in chunks]
     return [*single, _pooled(plan, ALL_FAULTS, ALL_FAULTS, None, wrong)]
 
 

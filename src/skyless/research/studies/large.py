@@ -79,6 +79,11 @@ class LargeCase(Struct, frozen=True):
     """Whether only cold starts are judged."""
     limits: tuple[Limit, ...] = ()
 
+    @property
+    def tags(self) -> int:
+        """Tags in a cell."""
+        return 12 if self.starts else 1
+
 
 def cases(plan: Plan) -> list[LargeCase]:
     """Sites and tags; limits stand where the issue of protocol 2 has figures."""
@@ -118,15 +123,6 @@ class LargeRow(Row, frozen=True, kw_only=True):
     """How often a tag had to begin again."""
 
 
-class LargeRun(Struct, frozen=True):
-    """The tags of one cell."""
-
-    case: LargeCase
-    plan: Plan
-    number: int
-    tags: int
-
-
 class LargeResult(Struct, frozen=True):
     """What they did; sums over fixes."""
 
@@ -154,12 +150,12 @@ def site_of(case: LargeCase) -> Site:
     return replace(site, accuracy=AccuracySite() if case.in_room else EXACT)
 
 
-def paths(run: LargeRun) -> list[Trajectory]:
+def _paths(case: LargeCase, plan: Plan, number: int) -> list[Trajectory]:
     """Where the tags of a cell go."""
-    draw = np.random.default_rng(seed_of(run.plan.seed, _PATH_KEY, run.number))
-    side_m = _SIDE * run.case.spacing_m
+    draw = np.random.default_rng(seed_of(plan.seed, _PATH_KEY, number))
+    side_m = _SIDE * case.spacing_m
     low_m, high_m = min(_EDGE_M, side_m / 4.0), side_m - min(_EDGE_M, side_m / 4.0)
-    return [_path(run.case, draw, low_m, high_m) for _ in range(run.tags)]
+    return [_path(case, draw, low_m, high_m) for _ in range(case.tags)]
 
 
 def _path(case: LargeCase, draw: np.random.Generator, low_m: float, high_m: float) -> Trajectory:
@@ -175,10 +171,9 @@ def _path(case: LargeCase, draw: np.random.Generator, low_m: float, high_m: floa
     return Waypoints([(x_m, y_m, _TAG_HEIGHT_M) for x_m, y_m in points], case.speed_mps, loop=True, corner_s=_CORNER_S)
 
 
-def tape_of(run: LargeRun) -> Tape:
+def _tape_of(case: LargeCase, plan: Plan, number: int) -> Tape:
     """The site on the air, and the tags of a cell in it."""
-    case, plan, site = run.case, run.plan, site_of(run.case)
-    draw = np.random.default_rng(seed_of(plan.seed, _PATH_KEY, run.number, 1))
+    site, draw = site_of(case), np.random.default_rng(seed_of(plan.seed, _PATH_KEY, number, 1))
     impairments = Impairments(
         tx_stamp_ps=plan.noise_ps,
         rx_stamp_ps=plan.noise_ps,
@@ -187,97 +182,75 @@ def tape_of(run: LargeRun) -> Tape:
     )
     return Tape(
         site,
-        paths(run),
+        _paths(case, plan, number),
         impairments,
-        seed_of(plan.seed, _PATH_KEY, run.number, 2) >> 1,
+        seed_of(plan.seed, _PATH_KEY, number, 2) >> 1,
         dead=draw.random(len(site.anchors)) < case.dead_share,
         survey_std_m=_ROOM.axis_std_m if case.in_room else 0.0,
     )
 
 
-def run_large(run: LargeRun) -> LargeResult:
+def run_large(case: LargeCase, plan: Plan, number: int) -> LargeResult:
     """Simulate the tags of a cell, and judge their fixes."""
-    tape, site = tape_of(run), site_of(run.case)
-    return _sum([_judge_tag(run, site, tape, tag) for tag in range(run.tags)])
+    tape = _tape_of(case, plan, number)
+    draws = [np.random.default_rng(seed_of(plan.seed, number, tag)) for tag in range(case.tags)]
+    return _sum([_judge_tag(case, plan, tape, tag, float(one.uniform(1.0, 20.0))) for tag, one in enumerate(draws)])
 
 
-def _judge_tag(run: LargeRun, site: Site, tape: Tape, tag: int) -> LargeResult:
-    case, plan = run.case, run.plan
+def _judge_tag(case: LargeCase, plan: Plan, tape: Tape, tag: int, begin_s: float) -> LargeResult:
+    receiver = Receiver()
     seconds = 1.0 if case.starts else _BOUND_S if case.bounded else case.seconds or plan.seconds
-    begin_s = float(np.random.default_rng(seed_of(plan.seed, run.number, tag)).uniform(1.0, 20.0))
-    log = _TagLog(Receiver())
     beacons: list[Heard] = []
-    at_s = begin_s
-    while at_s < begin_s + seconds and not (case.starts and log.first_fix_s is not None):
+    first_s, last_s, gap_s, at_s = math.inf, math.inf, 0.0, begin_s
+    joins = restarts = 0
+    judged: list[tuple[float, ...]] = []
+    while at_s < begin_s + seconds and not (case.starts and first_s < math.inf):
         for heard in tape.hear(tag, at_s, min(at_s + _SPAN_S, begin_s + seconds)):
-            log.add(heard)
+            fix, joined, restarted = _process(receiver, heard)
+            joins, restarts = joins + joined, restarts + restarted
+            if fix is not None:
+                now_s = heard.reception.host_s or 0.0
+                first_s = min(first_s, now_s)
+                gap_s, last_s = max(gap_s, now_s - last_s), now_s
+                if now_s - first_s >= _SETTLED_S:
+                    judged.append((len(beacons), *_judge(fix, heard.truth_m)))
             beacons.append(heard)
         at_s += _SPAN_S
-    bounds = _bound_m2(tape, site, beacons, case, plan) if case.bounded else np.zeros(0)
-    return log.result(seconds, bounds)
+    rows = np.array(judged).reshape(-1, 4)
+    bounds_m2 = _bound_m2(tape, beacons, case, plan)[rows[:, 0].astype(int)] if case.bounded else np.zeros(0)
+    return LargeResult(
+        fixes=len(rows),
+        squared_m2=float(rows[:, 1].sum()),
+        nees=float(rows[:, 2].sum()),
+        variance_m2=float(rows[:, 3].sum()),
+        errors_m=np.sqrt(rows[:, 1]),
+        bound_m2=float(bounds_m2.sum()),
+        beacons=len(beacons),
+        tag_s=seconds,
+        gap_s=gap_s,
+        first_fix_s=(first_s - (beacons[0].reception.host_s or 0.0) if beacons else math.inf,),
+        joins=joins,
+        restarts=restarts,
+    )
 
 
-class _TagLog:
-    """One tag, and what it did."""
+def _process(receiver: Receiver, heard: Heard) -> tuple[Fix | None, bool, bool]:
+    """A beacon's fix, if it gives one, and whether its anchor joined those in use, and whether the tag began again."""
+    anchor, method = heard.beacon.anchor, receiver.method
+    was_running = isinstance(method, Estimation) and not method.is_starting
+    was_in = isinstance(method, Estimation) and was_running and method.estimator.has_anchor(anchor)
+    fix = receiver.hear_beacon(heard.beacon, heard.reception)
+    method = receiver.method
+    if not isinstance(method, Estimation) or not was_running:
+        return fix, False, False
+    return fix, not method.is_starting and not was_in and method.estimator.has_anchor(anchor), method.is_starting
 
-    def __init__(self, receiver: Receiver) -> None:
-        self._receiver = receiver
-        self._first_beacon_s: float | None = None
-        self.first_fix_s: float | None = None
-        self._last_fix_s = 0.0
-        self._gap_s = 0.0
-        self._beacons = self._joins = self._restarts = 0
-        self._judged: list[tuple[int, float, float, float]] = []
-        """Number of the beacon, squared error, its normalised square, variance."""
 
-    def add(self, heard: Heard) -> None:
-        """Let the tag process one beacon."""
-        beacon, at_s = heard.beacon, heard.reception.host_s or 0.0
-        if self._first_beacon_s is None:
-            self._first_beacon_s = at_s
-        anchor, method = beacon.anchor, self._receiver.method
-        was_running = isinstance(method, Estimation) and not method.is_starting
-        was_in = isinstance(method, Estimation) and was_running and method.estimator.has_anchor(anchor)
-        fix = self._receiver.hear_beacon(beacon, heard.reception)
-        method = self._receiver.method
-        if isinstance(method, Estimation) and was_running:
-            self._restarts += method.is_starting
-            self._joins += not method.is_starting and not was_in and method.estimator.has_anchor(anchor)
-        self._beacons += 1
-        if fix is not None:
-            self._judge(fix, at_s, heard.truth_m)
-
-    def _judge(self, fix: Fix, at_s: float, truth_m: Array) -> None:
-        if self.first_fix_s is None:
-            self.first_fix_s = self._last_fix_s = at_s
-        self._gap_s = max(self._gap_s, at_s - self._last_fix_s)
-        self._last_fix_s = at_s
-        if at_s - self.first_fix_s < _SETTLED_S:
-            return
-        error, covariance = (fix.position_m - truth_m)[:2], fix.covariance_m2[:2, :2]
-        nees = float(error @ np.linalg.solve(covariance, error)) / 2.0
-        self._judged.append((self._beacons - 1, float(error @ error), nees, float(np.trace(covariance))))
-
-    def result(self, seconds: float, bounds_m2: Array) -> LargeResult:
-        """Sums over the fixes; ``bounds_m2``: of each beacon, or none."""
-        judged = np.array(self._judged).reshape(-1, 4)
-        first_s = math.inf
-        if self.first_fix_s is not None and self._first_beacon_s is not None:
-            first_s = self.first_fix_s - self._first_beacon_s
-        return LargeResult(
-            fixes=len(judged),
-            squared_m2=float(judged[:, 1].sum()),
-            nees=float(judged[:, 2].sum()),
-            variance_m2=float(judged[:, 3].sum()),
-            errors_m=np.sqrt(judged[:, 1]),
-            bound_m2=float(bounds_m2[judged[:, 0].astype(int)].sum()) if len(bounds_m2) else 0.0,
-            beacons=self._beacons,
-            tag_s=seconds,
-            gap_s=self._gap_s,
-            first_fix_s=(first_s,),
-            joins=self._joins,
-            restarts=self._restarts,
-        )
+def _judge(fix: Fix, truth_m: Array) -> tuple[float, float, float]:
+    """Squared error of a fix, its normalised square per dimension, and the variance, all horizontal."""
+    error, covariance = (fix.position_m - truth_m)[:2], fix.covariance_m2[:2, :2]
+    nees = float(error @ np.linalg.solve(covariance, error)) / 2.0
+    return float(error @ error), nees, float(np.trace(covariance))
 
 
 def _sum(tags: Sequence[LargeResult]) -> LargeResult:
@@ -293,8 +266,9 @@ def _sum(tags: Sequence[LargeResult]) -> LargeResult:
 # The bound
 
 
-def _bound_m2(tape: Tape, site: Site, heard: Sequence[Heard], case: LargeCase, plan: Plan) -> Array:
+def _bound_m2(tape: Tape, heard: Sequence[Heard], case: LargeCase, plan: Plan) -> Array:
     """Trace of the Cramér–Rao bound after each beacon of a tag, shape (beacons,)."""
+    site = site_of(case)
     row_of, beacons = {one.id: row for row, one in enumerate(site.anchors)}, [one.beacon for one in heard]
     ids = sorted({beacon.anchor for beacon in beacons})
     anchors_m = {identifier: tape.true_positions_m[row_of[identifier]] for identifier in ids}
@@ -306,19 +280,21 @@ def _bound_m2(tape: Tape, site: Site, heard: Sequence[Heard], case: LargeCase, p
 # Cells and rows
 
 
-def tag_runs(plan: Plan, case: LargeCase) -> list[LargeRun]:
-    """The cells of a case."""
-    tags = 12 if case.starts else 1
-    count = (8 if plan.quick else 16) if case.starts else min(plan.worlds, 2) if case.seconds else plan.worlds
-    return [LargeRun(case, plan, number, tags) for number in range(count)]
+def _worlds(plan: Plan, case: LargeCase) -> range:
+    """Numbers of the cells of a case."""
+    return range((8 if plan.quick else 16) if case.starts else min(plan.worlds, 2) if case.seconds else plan.worlds)
 
 
 def cells(plan: Plan) -> list[Cell]:
     """One cell for each tag, or for some cold starts."""
     return [
-        Cell(case.name, partial(run_large, run), _TAG_COST_S * run.tags * (case.seconds or plan.seconds) + 1.0)
+        Cell(
+            case.name,
+            partial(run_large, case, plan, number),
+            _TAG_COST_S * case.tags * (case.seconds or plan.seconds) + 1.0,
+        )
         for case in cases(plan)
-        for run in tag_runs(plan, case)
+        for number in _worlds(plan, case)
     ]
 
 
@@ -326,7 +302,7 @@ def rows(plan: Plan, results: Sequence[LargeResult]) -> list[Row]:
     """A row for each case; the results stand in the order of ``cells``."""
     rest = iter(results)
     return [
-        with_limits(row_of(plan, case, [next(rest) for _ in tag_runs(plan, case)]), case.limits) for case in cases(plan)
+        with_limits(row_of(plan, case, [next(rest) for _ in _worlds(plan, case)]), case.limits) for case in cases(plan)
     ]
 
 

@@ -16,7 +16,7 @@ from scipy.stats import chi2
 from scipy.stats import t as student
 
 from skyless.core.arrays import Array
-from skyless.research.studies.runner import AnyRow, Cell, Limit, Plan, Row, with_limits
+from skyless.research.studies.runner import AnyRow, Cell, Limit, Plan, Row, Study, with_limits
 from skyless.research.studies.worlds import Run, RunResult, bound_m2, run_world
 from skyless.research.uncertainty import Biases
 from skyless.site.report import BLUE, GREEN, GRID, INK, MUTED, ORANGE, RED, report_style
@@ -44,6 +44,10 @@ class Sides(Struct, frozen=True):
     safe: Literal["below", "above", "neither"] = "below"
     """``neither``: far from the limit is bad on both sides."""
 
+    def colour(self, side: str) -> str:
+        """Green for the safe side."""
+        return INK if self.safe == "neither" else GREEN if side == self.safe else RED
+
 
 CONFIDENCE: Final = Sides("errors smaller than reported: safe side", "errors larger than reported: too confident")
 """Sides of the ratio of squared errors to reported variances, whose limit is 1."""
@@ -55,18 +59,23 @@ BOUND: Final = Sides("below the bound: by chance alone", "above the bound: infor
 """Sides of the ratio of errors to the smallest possible ones, whose limit is 1."""
 
 
-def shade_sides(axes: Axes, sides: Sides, limit: float, *, along: Literal["x", "y"]) -> None:
-    """Shade and name both sides of a limit on the axis ``along``; call it after everything else is drawn."""
+def shade_sides(axes: Axes, sides: Sides, limit: float | None, *, along: Literal["x", "y"]) -> None:
+    """Shade and name both sides of a limit on the axis ``along``; call it after everything else is drawn.
+
+    Without a limit both directions are named.
+    """
+    for side, words in (("below", sides.below), ("above", sides.above)):
+        _name(axes, words, sides.colour(side), side, along)
+    if limit is None:
+        return
     low, high = sorted(axes.get_xlim() if along == "x" else axes.get_ylim())
     logarithmic = (axes.get_xscale() if along == "x" else axes.get_yscale()) == "log"
     high = max(high, limit * (_ROOM**3 if logarithmic else _ROOM))
     low = min(low, limit / (_ROOM**3 if logarithmic else _ROOM))
     span, set_limits = (axes.axvspan, axes.set_xlim) if along == "x" else (axes.axhspan, axes.set_ylim)
-    for start, end, side, words in ((low, limit, "below", sides.below), (limit, high, "above", sides.above)):
-        colour = INK if sides.safe == "neither" else GREEN if side == sides.safe else RED
+    for start, end, side in ((low, limit, "below"), (limit, high, "above")):
         if sides.safe != "neither":
-            span(start, end, color=colour, alpha=0.07, linewidth=0.0, zorder=0.5)
-        _name(axes, words, colour, side, along)
+            span(start, end, color=sides.colour(side), alpha=0.07, linewidth=0.0, zorder=0.5)
     set_limits(low, high)
 
 
@@ -83,16 +92,6 @@ def _name(axes: Axes, words: str, colour: str, side: str, along: Literal["x", "y
 
 
 # Panels
-
-
-class Look(Struct, frozen=True):
-    """How a study is drawn."""
-
-    title: str
-    panels: tuple[str, ...]
-    """Names of ``_PANELS``, side by side."""
-    x: str = ""
-    """What the numbers of a series mean; by default the series says it."""
 
 
 class _Panel(Struct, frozen=True):
@@ -120,7 +119,7 @@ class _Panel(Struct, frozen=True):
 _RARE: Final = 1e-6
 """Smallest share of exceeded levels that is drawn."""
 
-_PANELS: Final = {
+PANELS: Final = {
     "rmse": _Panel("RMSE in cm", "rmse_m", 100.0, error="rmse_error_m"),
     "ratio": _Panel("RMSE over bound", "ratio", error="ratio_error", target=1.0, sides=BOUND),
     "nees": _Panel("NEES per dimension", "nees", target=1.0, sides=CONFIDENCE),
@@ -146,20 +145,22 @@ _PANELS: Final = {
 }
 
 
-def draw(look: Look, rows: Sequence[Row]) -> Figure:
+def draw(study: Study, rows: Sequence[Row]) -> Figure:
     """Draw the rows of a study; error bars are standard errors."""
     with report_style():
         series = [(name, list(group)) for name, group in groupby(rows, key=lambda row: row.series)]
-        series = [(name, group) for name, group in series if _has_values(group, look)] or series
+        series = [(name, group) for name, group in series if _has_values(group, study.panels)] or series
         heights = [_CURVE_IN if _is_curve(group) else 0.8 + _BAR_IN * len(group) for _, group in series]
-        figure = Figure(figsize=(_WIDTH_IN * len(look.panels), sum(heights) + 0.5), layout="constrained")
+        figure = Figure(figsize=(_WIDTH_IN * len(study.panels), sum(heights) + 0.5), layout="constrained")
         methods = ", ".join(dict.fromkeys(row.method for row in rows))
-        note = "; grey: where 99 % of consistent ones lie" if "nees" in look.panels else ""
-        figure.suptitle(f"{look.title}: {methods}, simulated{note}", x=0.01, ha="left", fontsize=11.0)
-        grid = figure.subplots(len(series), len(look.panels), squeeze=False, height_ratios=heights)
+        note = "; grey: where 99 % of consistent ones lie" if "nees" in study.panels else ""
+        figure.suptitle(
+            f"{study.title[0].upper()}{study.title[1:]}: {methods}, simulated{note}", x=0.01, ha="left", fontsize=11.0
+        )
+        grid = figure.subplots(len(series), len(study.panels), squeeze=False, height_ratios=heights)
         for line, (name, group) in zip(grid, series, strict=True):
-            for axes, panel in zip(line, look.panels, strict=True):
-                _fill(axes, _PANELS[panel], group, look)
+            for axes, panel in zip(line, study.panels, strict=True):
+                _fill(axes, PANELS[panel], group, study.x)
             for axes in line[1:]:
                 if not _is_curve(group):
                     axes.set_yticklabels([])
@@ -167,20 +168,20 @@ def draw(look: Look, rows: Sequence[Row]) -> Figure:
     return figure
 
 
-def _has_values(rows: Sequence[Row], look: Look) -> bool:
+def _has_values(rows: Sequence[Row], panels: Sequence[str]) -> bool:
     """Whether any panel shows something of these rows; cold starts, for one, have no errors."""
-    return any(getattr(row, _PANELS[panel].figure, None) is not None for panel in look.panels for row in rows)
+    return any(getattr(row, PANELS[panel].figure, None) is not None for panel in panels for row in rows)
 
 
 def _is_curve(rows: Sequence[Row]) -> bool:
     return all(row.x is not None for row in rows)
 
 
-def _fill(axes: Axes, panel: _Panel, rows: list[Row], look: Look) -> None:
+def _fill(axes: Axes, panel: _Panel, rows: list[Row], x: str) -> None:
     values, errors = panel.values(rows, panel.figure), np.nan_to_num(panel.values(rows, panel.error))
     curve = _is_curve(rows)
     if curve:
-        _curve(axes, np.array([row.x for row in rows], dtype=np.float64), values, errors, look.x or rows[0].series)
+        _curve(axes, np.array([row.x for row in rows], dtype=np.float64), values, errors, x or rows[0].series)
         if panel.target is not None:
             axes.set_ylim(top=max(axes.get_ylim()[1], 1.3 * panel.target))
         axes.set(ylabel=panel.label)
@@ -189,16 +190,11 @@ def _fill(axes: Axes, panel: _Panel, rows: list[Row], look: Look) -> None:
         axes.set(xlabel=panel.label)
     if panel.target is not None:
         (axes.axhline if curve else axes.axvline)(panel.target, color=MUTED, linewidth=1.0, linestyle="--", zorder=1.5)
-    if panel is _PANELS["nees"]:
+    if panel is PANELS["nees"]:
         _intervals(axes, rows, curve=curve)
     _limits(axes, panel, rows, curve=curve)
     if panel.sides is not None:
-        limit = panel.target
-        if limit is None:
-            for side, words in (("below", panel.sides.below), ("above", panel.sides.above)):
-                _name(axes, words, GREEN if side == panel.sides.safe else RED, side, "y" if curve else "x")
-        else:
-            shade_sides(axes, panel.sides, limit, along="y" if curve else "x")
+        shade_sides(axes, panel.sides, panel.target, along="y" if curve else "x")
 
 
 def _curve(axes: Axes, x: Array, values: Array, errors: Array, label: str) -> None:
@@ -325,7 +321,15 @@ class WorldRow(Row, frozen=True, kw_only=True):
 
 def world_cells(cases: Sequence[Case]) -> list[Cell]:
     """One cell for each world of all cases, then one for the bound of each world that has one."""
-    worlds = [Cell(case.name, partial(run_world, run), _weight_s(run)) for case in cases for run in case.runs]
+    worlds = [
+        Cell(
+            case.name,
+            partial(run_world, run),
+            run.until_s / run.site.schedule.slot_s * _MESSAGE_S * (len(run.trajectories) + len(run.site.anchors)),
+        )
+        for case in cases
+        for run in case.runs
+    ]
     bounds = [
         Cell(case.name, partial(bound_m2, run, case.biases), _BOUND_TAG_S * len(run.trajectories) * run.until_s)
         for case in cases
@@ -333,11 +337,6 @@ def world_cells(cases: Sequence[Case]) -> list[Cell]:
         for run in case.runs
     ]
     return [*worlds, *bounds]
-
-
-def _weight_s(run: Run) -> float:
-    frames = run.until_s / run.site.schedule.slot_s
-    return frames * _MESSAGE_S * (len(run.trajectories) + len(run.site.anchors))
 
 
 def world_rows(study: str, plan: Plan, cases: Sequence[Case], results: Sequence[Any]) -> list[WorldRow]:
@@ -376,18 +375,15 @@ def case_row(
     )
     if fixes == 0:
         return row
-    row = _with_levels(_with_errors(row, worlds), worlds)
-    return row if reference is None else _with_ratio(row, worlds, reference)
-
-
-def _with_errors(row: WorldRow, worlds: Sequence[RunResult]) -> WorldRow:
     sums = np.array([(world.fixes, world.squared_m2, world.nees) for world in worlds])
-    return replace(
+    row = replace(
         with_errors(row, sums, np.concatenate([world.sample_m for world in worlds])),
         max_m=max(world.max_m for world in worlds),
-        said_m=(sum(world.variance_m2 for world in worlds) / row.fixes) ** 0.5,
-        outside=sum(world.outside for world in worlds) / row.fixes,
+        said_m=(sum(world.variance_m2 for world in worlds) / fixes) ** 0.5,
+        outside=sum(world.outside for world in worlds) / fixes,
     )
+    row = _with_levels(row, worlds)
+    return row if reference is None else _with_ratio(row, worlds, reference)
 
 
 def with_errors(row: AnyRow, sums: Array, errors_m: Array) -> AnyRow:
@@ -406,12 +402,10 @@ def with_errors(row: AnyRow, sums: Array, errors_m: Array) -> AnyRow:
 
 def _with_levels(row: WorldRow, worlds: Sequence[RunResult]) -> WorldRow:
     """Add protection levels, with tags as units, where the method gives some."""
-    counts = [world.levels for world in worlds if world.levels is not None]
-    if not counts:
+    tallies = [world.levels for world in worlds if world.levels is not None]
+    if not tallies:
         return row
-    levels, exceeded, unwarned = (
-        np.concatenate([getattr(one, name) for one in counts]) for name in ("levels", "exceeded", "unwarned")
-    )
+    levels, exceeded, unwarned = np.concatenate([(one.levels, one.exceeded, one.unwarned) for one in tallies], axis=1)
     count = levels.sum()
     row = replace(row, level=count / row.fixes)
     if not count:
@@ -422,7 +416,7 @@ def _with_levels(row: WorldRow, worlds: Sequence[RunResult]) -> WorldRow:
         exceeded=exceeded.sum() / count,
         exceeded_interval=(min(low, 1.0), min(high, 1.0)),
         exceeded_unwarned=unwarned.sum() / count,
-        hpl_m=float(np.median(np.concatenate([one.hpl_m for one in counts]))),
+        hpl_m=float(np.median(np.concatenate([one.hpl_m for one in tallies]))),
     )
 
 

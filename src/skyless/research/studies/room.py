@@ -54,7 +54,7 @@ _STAIRWELL_HEIGHTS_M: Final = (0.2, 3.8, 1.4, 5.0, 0.8, 4.4, 2.0, 5.2)
 """Heights of its anchors, in their order around the walls."""
 _LINE_M: Final = (10.0, 0.1)
 """Length of the row of anchors along a wall, and by how much every second one stands off it."""
-_BESIDE_M: Final = ((0.5, 1.0), (9.5, 5.0))
+_BESIDE_M: Final = (np.array((0.5, 1.0, 0.0)), np.array((9.5, 5.0, 0.0)))
 """Corners of the box in which tags wander beside that row."""
 
 WALL: Final = WallSite(4.0, 3.0, 4.0, 5.0, delay_m=0.25)
@@ -173,7 +173,7 @@ def _rooms(plan: Plan) -> list[Case]:
             "rooms",
             *(Limit("level", most=0.0), _exceeded(0.0)),
             site=line_site(plan.noise_ps),
-            paths=partial(_beside_the_line, plan.tags),
+            paths=lambda seed: [wanderer(*_BESIDE_M, seed, tag) for tag in range(plan.tags)],
         ),
     ]
 
@@ -200,11 +200,6 @@ def _rests(plan: Plan) -> list[Case]:
 def still(site: Site, tags: int, seed: int) -> Sequence[Trajectory]:
     """Tags at rest where those that wander begin."""
     return [Static(*path.position(0.0).tolist()) for path in wanderers(site, tags, seed)]
-
-
-def _beside_the_line(tags: int, seed: int) -> Sequence[Trajectory]:
-    low_m, high_m = (np.array((*corner_m, 0.0)) for corner_m in _BESIDE_M)
-    return [wanderer(low_m, high_m, seed, tag) for tag in range(tags)]
 
 
 def _errors(plan: Plan) -> list[Case]:
@@ -399,13 +394,13 @@ def _locking(plan: Plan, motion: str, rate_hz: float, random_walk_fm: float, **o
     site = lab_site(plan.noise_ps)
     schedule = replace(site.schedule, rate_hz=rate_hz / len(site.anchors), carrier_phase=True)
     site = replace(site, noise=replace(site.noise, random_walk_fm=random_walk_fm), schedule=schedule)
-    paths = wanderers if motion == "walking" else _hand_paths
-    return worlds(plan, site, partial(paths, site, plan.tags), room=Room(), **options)
 
+    def paths(seed: int) -> list[Trajectory]:
+        if motion == "walking":
+            return wanderers(site, plan.tags, seed)
+        return [wanderer(*box(site), seed, tag, qa_m2ps3=3.0) for tag in range(plan.tags)]
 
-def _hand_paths(site: Site, tags: int, seed: int) -> list[Trajectory]:
-    low_m, high_m = box(site)
-    return [wanderer(low_m, high_m, seed, tag, qa_m2ps3=3.0) for tag in range(tags)]
+    return worlds(plan, site, paths, room=Room(), **options)
 
 
 CONDITIONS: Final[dict[str, Callable[[Plan], list[Case]]]] = {

@@ -1,7 +1,6 @@
 """The studies by name, and how one is run."""
 
 from collections.abc import Callable, Sequence
-from functools import partial
 from pathlib import Path
 from typing import Any, Final
 
@@ -9,8 +8,7 @@ from msgspec import Struct
 
 from skyless.core.errors import SkylessError
 from skyless.research.studies import efficiency, integrity, large, room, survey, surveyed_rooms, watch
-from skyless.research.studies.picture import Look, draw
-from skyless.research.studies.runner import KeptResults, Plan, Row, Study, UnfinishedError, run_cells, run_cells_here
+from skyless.research.studies.runner import KeptResults, Plan, Row, Study, UnfinishedError, run_cells
 
 OF_EPISODES: Final = ("efficiency", "integrity")
 """Studies of episodes, which have no worlds."""
@@ -52,10 +50,7 @@ def run_study(
             kept.keep(numbers[index], result)
 
     try:
-        if processes == 1 or not missing:
-            run_cells_here(missing, on_progress, finished)
-        else:
-            run_cells(missing, on_progress, processes, finished)
+        run_cells(missing, on_progress, processes, finished)
     except UnfinishedError as error:
         raise SkylessError(f"{error}; {way_on(resume)}") from None
     return chosen.rows(plan, [results[number] for number in range(len(cells))]), parts
@@ -72,7 +67,7 @@ def way_on(resume: str | Path | None) -> str:
 
 
 def _study(name: str, title: str, module: Any, *panels: str, x: str = "") -> Study:  # noqa: ANN401 - a module
-    return Study(name, title, module.cells, module.rows, partial(draw, Look(title[0].upper() + title[1:], panels, x)))
+    return Study(name, title, module.cells, module.rows, panels, x)
 
 
 STUDIES: Final = {

@@ -19,7 +19,6 @@ from typing import Any, Final, TypeVar
 
 import msgspec
 import numpy as np
-from matplotlib.figure import Figure
 from msgspec import Struct
 from msgspec.structs import replace
 
@@ -90,6 +89,15 @@ class Cell(Struct, frozen=True):
     """Approximate duration: the longest cells begin first."""
 
 
+AnyCase = TypeVar("AnyCase")
+
+
+def of_cases(cases: Sequence[AnyCase], results: Sequence[Any]) -> list[tuple[AnyCase, Sequence[Any]]]:
+    """Each case with the results of its cells, of which all cases have the same number."""
+    each = len(results) // len(cases)
+    return [(case, results[each * number : each * (number + 1)]) for number, case in enumerate(cases)]
+
+
 class Limit(Struct, frozen=True):
     """What a figure of a row should be at least, at most, or both."""
 
@@ -158,11 +166,11 @@ AnyRow = TypeVar("AnyRow", bound=Row)
 
 
 def with_limits(row: AnyRow, limits: Sequence[Limit]) -> AnyRow:
-    """Add limits and the figures that miss them to a row. Without a fix, only limits on levels can hold."""
+    """Add limits and the figures that miss them to a row. Without a fix there is no error, which misses its limit."""
     if not limits:
         return row
-    possible = {one.figure for one in limits} if row.fixes else {"level", "exceeded"}
-    missed = tuple(one.figure for one in limits if one.figure not in possible or not one.holds(row))
+    lacking = {one.figure for one in limits if getattr(row, one.figure) is None} - {"level", "exceeded"}
+    missed = tuple(one.figure for one in limits if not one.holds(row) or (one.figure in lacking and not row.fixes))
     return replace(row, limits=tuple(limits), missed=missed, passed=not missed)
 
 
@@ -174,8 +182,10 @@ class Study(Struct, frozen=True):
     cells: Callable[[Plan], list[Cell]]
     rows: Callable[[Plan, Sequence[Any]], Sequence[Row]]
     """Takes the results in the order of the cells."""
-    draw: Callable[[Sequence[Any]], Figure]
-    """Draws rows of its own kind."""
+    panels: tuple[str, ...]
+    """Panels of the picture (``picture.PANELS``), side by side."""
+    x: str = ""
+    """What the numbers of a series mean; by default the series says it."""
 
 
 MEASURED: Final = ("cpu_us_per_message", "cpu_ms_per_tag_s")
@@ -205,10 +215,12 @@ def run_cells(
 ) -> list[Any]:
     """Results in the order of the cells, computed by ``processes`` processes, by default one for each core.
 
-    An interrupt ends all processes at once.
+    One process is this one, which computes one cell after the other. An interrupt ends all processes at once.
 
     Raises UnfinishedError: a process died.
     """
+    if processes == 1 or not cells:
+        return _one_by_one(cells, reached, keep)
     with _pool(min(processes or cores(), len(cells))) as pool:
         try:
             return _map(lambda cell: pool.submit(cell.function), cells, reached, keep)
@@ -216,8 +228,7 @@ def run_cells(
             raise UnfinishedError("a process died, killed from outside or for want of memory") from None
 
 
-def run_cells_here(cells: Sequence[Cell], reached: Reached, keep: Keep) -> list[Any]:
-    """As ``run_cells``, in this process and thread, one after the other."""
+def _one_by_one(cells: Sequence[Cell], reached: Reached, keep: Keep) -> list[Any]:
     total_s, done_s, results = sum(cell.weight_s for cell in cells), 0.0, []
     for number, cell in enumerate(cells):
         results.append(cell.function())

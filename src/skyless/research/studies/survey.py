@@ -6,8 +6,9 @@ Several surveys with other facts may use the air of one run.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from functools import partial
+from itertools import chain
 from typing import Any, Final
 
 import numpy as np
@@ -158,58 +159,41 @@ class SurveyRow(Row, frozen=True, kw_only=True):
     """The same by positions measured by hand to 2 cm per axis, with delays unknown."""
 
 
-class SurveyRuns(Struct, frozen=True):
-    """Runs of one group on one layout."""
-
-    layout: str
-    group: Group
-    seeds: tuple[int, ...]
-    seconds: float
-    noise_ps: float
-
-
 def cells(plan: Plan) -> list[Cell]:
     """Some runs of one group on one layout each."""
     found = []
-    for runs in _all_runs(plan):
-        weight_s = len(runs.seeds) * (0.06 * runs.seconds + 0.3 * len(runs.group.variants))
-        found.append(Cell(f"{runs.layout}, {runs.group.name}", partial(survey_runs, runs), weight_s))
-    return found
-
-
-def _all_runs(plan: Plan) -> list[SurveyRuns]:
-    found = []
     for number, (layout, groups) in enumerate(GROUPS.items()):
         for kind, group in enumerate(groups):
-            seeds = [seed_of(plan.seed, number, kind, world) for world in range(plan.worlds)]
             seconds = plan.seconds if group.seconds is None else min(group.seconds, plan.seconds)
-            found += [
-                SurveyRuns(layout, group, tuple(seeds[first : first + _RUNS_IN_A_CELL]), seconds, plan.noise_ps)
-                for first in range(0, plan.worlds, _RUNS_IN_A_CELL)
-            ]
+            for first in range(0, plan.worlds, _RUNS_IN_A_CELL):
+                worlds = range(first, min(first + _RUNS_IN_A_CELL, plan.worlds))
+                seeds = [seed_of(plan.seed, number, kind, world) for world in worlds]
+                run = partial(survey_runs, layout, group, seeds, seconds, plan.noise_ps)
+                found.append(
+                    Cell(f"{layout}, {group.name}", run, len(seeds) * (0.06 * seconds + 0.3 * len(group.variants)))
+                )
     return found
 
 
-def survey_runs(runs: SurveyRuns) -> tuple[tuple[Outcome, ...], ...]:
-    """Outcomes of each run, one for each variant."""
-    return tuple(
-        _run(runs, drawn_errors(survey_layouts()[runs.layout], runs.group.errors, runs.noise_ps, seed))
-        for seed in runs.seeds
-    )
+def survey_runs(
+    layout: str, group: Group, seeds: Sequence[int], seconds: float, noise_ps: float
+) -> tuple[Outcome, ...]:
+    """Outcomes of each run, one for each variant of the group."""
+    rooms = (drawn_errors(survey_layouts()[layout], group.errors, noise_ps, seed) for seed in seeds)
+    return tuple(outcome for room in rooms for outcome in _run(room, group, seconds))
 
 
-def _run(runs: SurveyRuns, room: DrawnRoom) -> tuple[Outcome, ...]:
-    layout, ranges = room.layout, ranges_in_air(room, runs.seconds)
+def _run(room: DrawnRoom, group: Group, seconds: float) -> Iterator[Outcome]:
+    layout, ranges = room.layout, ranges_in_air(room, seconds)
     hand_tag_m = tag_error_m(layout, layout.position_m + room.hand_m, np.zeros(len(layout.anchors)), room.tx_delay_m)
-    outcomes, asked_for = [], tuple[TapeAdvice, ...]()
-    for variant in runs.group.variants:
-        facts = _facts(room, runs.group, variant, asked_for[: variant.tapes])
+    asked_for = tuple[TapeAdvice, ...]()
+    for variant in group.variants:
+        facts = _facts(room, group, variant, asked_for[: variant.tapes])
         survey = run_survey(ranges, facts)
         if not variant.tapes and not variant.keeps:
             asked_for = survey.tapes
-        bound_m = survey_bound_m(room, ranges, facts, runs.seconds)
-        outcomes.append(judged(room, survey, Outcome(variant.name, bound_m, False, False, False, hand_tag_m)))
-    return tuple(outcomes)
+        bound_m = survey_bound_m(room, ranges, facts, seconds)
+        yield judged(room, survey, variant.name, bound_m, hand_tag_m)
 
 
 def _facts(room: DrawnRoom, group: Group, variant: Variant, tapes: Sequence[TapeAdvice]) -> Facts:
@@ -228,10 +212,8 @@ def _facts(room: DrawnRoom, group: Group, variant: Variant, tapes: Sequence[Tape
 def rows(plan: Plan, results: Sequence[Any]) -> list[Row]:
     """A row for each layout and variant."""
     found: dict[tuple[str, str], list[Outcome]] = {}
-    for runs, outcomes in zip(_all_runs(plan), results, strict=True):
-        for of_run in outcomes:
-            for outcome in of_run:
-                found.setdefault((runs.layout, outcome.variant), []).append(outcome)
+    for outcome in chain.from_iterable(results):
+        found.setdefault((outcome.layout, outcome.variant), []).append(outcome)
     return [_row(plan, layout, variant, outcomes) for (layout, variant), outcomes in found.items()]
 
 

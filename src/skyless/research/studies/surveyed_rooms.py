@@ -27,7 +27,7 @@ from skyless.core.geometry import anchor_positions
 from skyless.core.site import EXACT, AccuracySite, AnchorSite, ScheduleSite, Site, TagsSite
 from skyless.core.ticks import SPEED_OF_LIGHT_MPS, TICK_M
 from skyless.research.studies.picture import Case, case_row
-from skyless.research.studies.runner import Cell, Limit, Plan, Row, seed_of, with_limits
+from skyless.research.studies.runner import Cell, Limit, Plan, Row, of_cases, seed_of, with_limits
 from skyless.research.studies.worlds import Run, RunResult, run_world
 from skyless.sim.evaluation.scenarios import Room, wanderers
 from skyless.sim.impairments import (
@@ -101,9 +101,6 @@ def survey_layouts() -> dict[str, SurveyLayout]:
 
 # Ranges of a site's anchors from simulated air, with real machines.
 
-OnLeg = Callable[[int, int, int, int, float], None]
-"""Called with sender, receiver, TX and RX ticks, and true time, like ``PairRanger.add``."""
-
 
 def stamps_of(site: Site, impairments: Impairments, seconds: float, seed: int, *, settle_s: float = 0.0) -> PairRanger:
     """Ranges of a site from all receptions of its anchors within ``seconds``.
@@ -116,10 +113,8 @@ def stamps_of(site: Site, impairments: Impairments, seconds: float, seed: int, *
         if t_s >= settle_s:
             whole.add(sender, receiver, tx_ticks, rx_ticks, t_s)
 
-    def new_recorded(anchor: int) -> RecordedAnchor:
-        return RecordedAnchor(new_anchor(site, anchor), site.id, on_leg)
-
-    for _ in World(site, new_recorded, (), impairments, seed).run(settle_s + seconds):
+    world = World(site, lambda one: RecordedAnchor(new_anchor(site, one), site.id, on_leg), (), impairments, seed)
+    for _ in world.run(settle_s + seconds):
         pass
     whole.finish()
     return whole
@@ -128,7 +123,10 @@ def stamps_of(site: Site, impairments: Impairments, seconds: float, seed: int, *
 class RecordedAnchor:
     """An anchor whose receptions from its site are passed on as legs."""
 
-    def __init__(self, machine: AnchorMachine, site_id: int, on_leg: OnLeg) -> None:
+    def __init__(
+        self, machine: AnchorMachine, site_id: int, on_leg: Callable[[int, int, int, int, float], None]
+    ) -> None:
+        """``on_leg``: called with sender, receiver, TX and RX ticks, and true time, like ``PairRanger.add``."""
         self._machine, self._site_id, self._on_leg = machine, site_id, on_leg
 
     @property
@@ -275,6 +273,7 @@ _GRID: Final = np.linspace(0.15, 0.85, 5)
 class Outcome(Struct, frozen=True):
     """Evaluation of one survey. Lengths are RMS over anchors, after the best rigid alignment."""
 
+    layout: str
     variant: str
     bound_m: float
     """Cramér–Rao bound of the anchors' distance error."""
@@ -329,18 +328,20 @@ def survey_bound_m(room: DrawnRoom, ranges: PairRanges, facts: Facts, seconds: f
     return math.sqrt(float(np.trace(covariance[: 3 * n, : 3 * n])) / n)
 
 
-def judged(room: DrawnRoom, survey: Survey, outcome: Outcome) -> Outcome:
-    """The outcome with the survey's figures added."""
+def judged(room: DrawnRoom, survey: Survey, variant: str, bound_m: float, hand_tag_m: float) -> Outcome:
+    """A survey compared with the truth of its room; ``bound_m`` and ``hand_tag_m`` as in ``Outcome``."""
     layout = room.layout
     is_determined = all(one.determined for one in survey.anchors) and len(survey.anchors) == len(layout.anchors)
-    flagged = bool(survey.ambiguities) or survey.unchecked is not None or not is_determined
     excluded = {(pair.a, pair.b) for pair in survey.pairs if pair.excluded}
     used = {(pair.a, pair.b) for pair in survey.pairs}
-    outcome = replace(
-        outcome,
+    outcome = Outcome(
+        layout=layout.name,
+        variant=variant,
+        bound_m=bound_m,
         is_determined=is_determined,
         is_open=bool(survey.not_determined),
-        is_flagged=flagged,
+        is_flagged=bool(survey.ambiguities) or survey.unchecked is not None or not is_determined,
+        hand_tag_m=hand_tag_m,
         late=len(room.late),
         found=len(room.late & excluded),
         direct=len(used - room.late),
@@ -540,19 +541,6 @@ class Group(Struct, frozen=True):
     """Tags at rest, delays known and no errors but noise; the survey knows that."""
 
 
-class RoomRun(Struct, frozen=True):
-    """One world of a group."""
-
-    group: Group
-    plan: Plan
-    world: int
-
-    @property
-    def survey_s(self) -> float:
-        """How long its anchors survey themselves."""
-        return min(_SURVEY_S, 2.0 * self.plan.seconds)
-
-
 def groups() -> tuple[Group, ...]:
     """The lab and the room in 3-D, with errors of pairs from none on; then tags at rest in the lab."""
     of_layout = {"lab": (TRUTH, SURVEYED, TAPED, KEPT, HAND), "room": (TRUTH, SURVEYED, KEPT, HAND)}
@@ -582,18 +570,24 @@ def limits_of(group: Group, file: str) -> tuple[Limit, ...]:
 
 def cells(plan: Plan) -> list[Cell]:
     """One cell for each world."""
-    found = []
-    for run in (RoomRun(group, plan, world) for group in groups() for world in range(plan.worlds)):
-        weight_s = run.survey_s * 0.06 + len(run.group.files) * plan.tags * (plan.seconds + _WARMUP_S) * _RUN_S
-        found.append(Cell(run.group.name, partial(room_results, run), weight_s))
-    return found
+    survey_s, tags_s = _survey_s(plan) * 0.06, plan.tags * (plan.seconds + _WARMUP_S) * _RUN_S
+    return [
+        Cell(group.name, partial(room_results, plan, group, world), survey_s + len(group.files) * tags_s)
+        for group in groups()
+        for world in range(plan.worlds)
+    ]
 
 
-def room_results(run: RoomRun) -> tuple[RunResult, ...]:
+def _survey_s(plan: Plan) -> float:
+    """How long anchors survey themselves."""
+    return min(_SURVEY_S, 2.0 * plan.seconds)
+
+
+def room_results(plan: Plan, group: Group, world: int) -> tuple[RunResult, ...]:
     """Results of the tags with each file of a room."""
-    plan, seed = run.plan, seed_of(run.plan.seed, run.world)
-    room = drawn_room(survey_layouts()[run.group.layout], run.group.errors, plan.noise_ps, seed)
-    if run.group.at_rest:
+    seed = seed_of(plan.seed, world)
+    room = drawn_room(survey_layouts()[group.layout], group.errors, plan.noise_ps, seed)
+    if group.at_rest:
         paths: tuple[Trajectory, ...] = (Static(3.0, 4.0, 0.0),) * plan.tags
     else:
         paths = tuple(wanderers(site_at(room.layout, room.layout.position_m, plan.noise_ps), plan.tags, room.seed))
@@ -609,13 +603,13 @@ def room_results(run: RoomRun) -> tuple[RunResult, ...]:
                 until_s=_WARMUP_S + plan.seconds,
             )
         )
-        for site in _files(run, room)
+        for site in _files(plan, group, room)
     )
 
 
-def _files(run: RoomRun, room: DrawnRoom) -> list[Site]:
-    ranges = ranges_of(room, run.survey_s)
-    if run.group.at_rest:
+def _files(plan: Plan, group: Group, room: DrawnRoom) -> list[Site]:
+    ranges = ranges_of(room, _survey_s(plan))
+    if group.at_rest:
         return [replace(true_site(room), accuracy=EXACT), surveyed_room(room, ranges, is_exact=True)]
     made = {
         TRUTH: lambda: true_site(room),
@@ -624,14 +618,13 @@ def _files(run: RoomRun, room: DrawnRoom) -> list[Site]:
         KEPT: lambda: kept_site(room, ranges),
         HAND: lambda: hand_site(room),
     }
-    return [made[file]() for file in run.group.files]
+    return [made[file]() for file in group.files]
 
 
 def rows(plan: Plan, results: Sequence[Any]) -> Sequence[Row]:
     """A row for each group and file; the ratio is that to the truth's RMSE in the same worlds."""
     found = []
-    for number, group in enumerate(groups()):
-        worlds: Sequence[tuple[RunResult, ...]] = results[number * plan.worlds : (number + 1) * plan.worlds]
+    for group, worlds in of_cases(groups(), results):
         truth = [world[0] for world in worlds]
         for column, file in enumerate(group.files):
             own = [world[column] for world in worlds]

@@ -11,12 +11,11 @@ from typing import Any, Final, Literal
 
 import numpy as np
 from msgspec import Struct
-from msgspec.structs import replace
 
 from skyless.core.arrays import Array, Integers, Mask
 from skyless.core.ticks import SPEED_OF_LIGHT_MPS
-from skyless.research.studies.runner import Cell, Limit, Plan, Row, seed_of
-from skyless.research.studies.surveyed_rooms import SurveyLayout, survey_layouts
+from skyless.research.studies.runner import Cell, Limit, Plan, Row, of_cases, seed_of, with_limits
+from skyless.research.studies.surveyed_rooms import SLOT_S, SurveyLayout, survey_layouts
 from skyless.site.survey.explain import Finding, Kind, is_significant, pairs_of
 from skyless.site.survey.facts import PairBlock
 from skyless.site.survey.watch import GRACE_S, AnchorWatch
@@ -24,7 +23,6 @@ from skyless.site.survey.watch import GRACE_S, AnchorWatch
 Event = Literal["none", "moved", "delay", "link", "door", "two moved", "slow"]
 
 _WINDOW_S: Final = 10.0
-_SLOT_S: Final = 2.5e-3
 _STAMP_S: Final = 100e-12
 """Noise of every TX and RX stamp."""
 
@@ -62,15 +60,6 @@ class WatchCase(Struct, frozen=True):
     missing: float = 0.0
     """Share of pairs without ranges."""
     limits: tuple[Limit, ...] = ()
-
-
-class WatchRun(Struct, frozen=True):
-    """Events of one kind, one after another."""
-
-    case: WatchCase
-    events: int
-    """Number of events; of windows for the event ``none``."""
-    seed: int
 
 
 class WatchResult(Struct, frozen=True):
@@ -163,9 +152,8 @@ def cells(plan: Plan) -> list[Cell]:
     for number, case in enumerate(_cases()):
         events = _QUIET_WINDOWS if case.event == "none" else _EVENTS
         for world in range(plan.worlds):
-            run = WatchRun(case, events, seed_of(plan.seed, number, world))
-            weight_s = events * (_QUIET_COST_S if case.event == "none" else _EVENT_COST_S)
-            worlds.append(Cell(case.name, partial(run_watch, run), weight_s))
+            run = partial(run_watch, case, events, seed_of(plan.seed, number, world))
+            worlds.append(Cell(case.name, run, events * (_QUIET_COST_S if case.event == "none" else _EVENT_COST_S)))
     windows = _NOISE_WINDOWS // plan.worlds
     for world in range(plan.worlds):
         seed = seed_of(plan.seed, len(_cases()), world)
@@ -176,12 +164,10 @@ def cells(plan: Plan) -> list[Cell]:
 
 def rows(plan: Plan, results: Sequence[Any]) -> Sequence[Row]:
     """One for each case."""
-    of_case = [results[start : start + plan.worlds] for start in range(0, len(results), plan.worlds)]
-    *of_drawn, of_noise = of_case
-    found = [_row(plan, case, one) for case, one in zip(_cases(), of_drawn, strict=True)]
+    found = [_row(plan, case, own) for case, own in of_cases(_cases(), results[: -plan.worlds])]
     windows, limits = plan.worlds * (_NOISE_WINDOWS // plan.worlds), (Limit("alarms", most=1),)
-    noise = _judged(plan, _NOISE_CASE, "windows of 0.1 s, no drift", windows, limits, alarms=sum(of_noise))
-    return [noise, *found]
+    alarms = sum(results[-plan.worlds :])
+    return [_judged(plan, _NOISE_CASE, "windows of 0.1 s, no drift", windows, limits, alarms=alarms), *found]
 
 
 def _row(plan: Plan, case: WatchCase, results: Sequence[WatchResult]) -> WatchRow:
@@ -208,8 +194,7 @@ def _judged(plan: Plan, case: str, series: str, runs: int, limits: tuple[Limit, 
     row = WatchRow(
         study="watch", method=plan.method, case=case, series=series, noise_ps=plan.noise_ps, runs=runs, **figures
     )
-    missed = tuple(limit.figure for limit in limits if not limit.holds(row))
-    return replace(row, limits=limits, missed=missed, passed=not missed if limits else None)
+    return with_limits(row, limits)
 
 
 # A site whose ranges are drawn, and events that change them
@@ -233,7 +218,7 @@ class _Site:
             self._drift_std_m[draw.integers(m)] = case.lively_m
         self._drift_m = self._drift_std_m * draw.standard_normal(m)
         self._kept = math.exp(-_WINDOW_S / case.drift_s)
-        self._superframe_s = n * _SLOT_S
+        self._superframe_s = n * SLOT_S
         self._stamp_m = _STAMP_S * SPEED_OF_LIGHT_MPS
         self.step = 0
         at_m = {
@@ -264,24 +249,24 @@ class _Site:
         self.watch.advance(self.step * _WINDOW_S + GRACE_S)
 
 
-def run_watch(run: WatchRun) -> WatchResult:
-    """Run the events one after another, and count the watch's findings."""
-    draw = np.random.default_rng(run.seed)
-    site = _Site(run.case, draw)
+def run_watch(case: WatchCase, events: int, seed: int) -> WatchResult:
+    """Run the events one after another, and count the watch's findings; ``events``: windows where nothing happens."""
+    draw = np.random.default_rng(seed)
+    site = _Site(case, draw)
     for _ in range(LEARNING_WINDOWS):
         site.run_step()
-    if run.case.event == "none":
-        return _undisturbed(site, run.events)
+    if case.event == "none":
+        return _undisturbed(site, events)
     found_s: list[float] = []
     counts = dict.fromkeys(("found", "named", "kind", "wrong"), 0)
     alarms = alarms_moved = windows = 0
-    for _ in range(run.events):
+    for _ in range(events):
         standing = site.watch.findings
         alarms += len(standing)
         alarms_moved += sum(one.kind in {"moved", "delay"} for one in standing)
         if standing:  # so that earlier findings do not count for the next event
             site.watch.accept()
-        truth, findings, passed_s, took = _happen(site, run.case, draw)
+        truth, findings, passed_s, took = _happen(site, case, draw)
         windows += took
         if findings:
             found_s.append(passed_s)
@@ -296,7 +281,7 @@ def run_watch(run: WatchRun) -> WatchResult:
             site.run_step()
             windows += 1
     return WatchResult(
-        tries=run.events, found_s=tuple(found_s), alarms=alarms, alarms_moved=alarms_moved, windows=windows, **counts
+        tries=events, found_s=tuple(found_s), alarms=alarms, alarms_moved=alarms_moved, windows=windows, **counts
     )
 
 
@@ -381,7 +366,7 @@ def striking_windows(layout: SurveyLayout, window_s: float, alarm: float, window
     n = len(position_m)
     first, second = np.triu_indices(n, 1)
     m = len(first)
-    std_m = _STAMP_S * SPEED_OF_LIGHT_MPS / math.sqrt(window_s / (n * _SLOT_S))
+    std_m = _STAMP_S * SPEED_OF_LIGHT_MPS / math.sqrt(window_s / (n * SLOT_S))
     pairs = pairs_of(position_m, first, second, layout.dimensions, np.full(m, std_m), np.zeros(m))
     found = 0
     for start in range(0, windows, _CHUNK):

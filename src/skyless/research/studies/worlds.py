@@ -18,13 +18,11 @@ from skyless.core.air.beacon import Beacon, decode_cached
 from skyless.core.air.frame import Reception
 from skyless.core.any_receiver import AnyReceiver
 from skyless.core.arrays import Array
-from skyless.core.fix import Fix
 from skyless.core.geometry import anchor_positions
-from skyless.core.integrity import IntegrityRequirement
 from skyless.core.site import AnchorSite, NoiseSite, Site
 from skyless.research.studies.runner import Plan, seed_of
 from skyless.research.uncertainty import Biases, BoundSettings, Sendings, received_bound, relayed_receptions
-from skyless.sim.evaluation.figures import EvenSample, FirstFixes, LevelCounts, LevelTally
+from skyless.sim.evaluation.figures import EvenSample, FirstFixes, LevelTally
 from skyless.sim.evaluation.fleet import world_of
 from skyless.sim.evaluation.scenarios import ROOM_QA_M2PS3, WALL_MARGIN_M, Request, impairments_of, trajectories_of
 from skyless.sim.impairments import Impairments
@@ -64,7 +62,6 @@ class Run(Struct, frozen=True):
     until_s: float
     lost_at_tags: float = 0.0
     """Probability that a tag does not hear a message which anchors may well hear."""
-    integrity: IntegrityRequirement = IntegrityRequirement()
 
 
 class RunResult(Struct, frozen=True):
@@ -89,55 +86,8 @@ class RunResult(Struct, frozen=True):
     """Seconds of all tags together."""
     cpu_s: float
     """CPU time of the tags, measured."""
-    levels: LevelCounts | None = None
+    levels: LevelTally | None = None
     """None for methods that give no protection levels."""
-
-
-class _Tally:
-    """Sums over the judged fixes of a world."""
-
-    def __init__(self, run: Run) -> None:
-        tags = len(run.trajectories)
-        self._first_fixes = FirstFixes(run.site, tags)
-        self._from_s = run.warmup_s
-        self._dim = 2 if run.site.tags.height_m is not None else 3
-        self._outside_chi2 = float(chi2.ppf(_OUTSIDE, self._dim))
-        self._sums = np.zeros(4)
-        self._max_m = 0.0
-        self._sample = EvenSample(1, _SAMPLE_ROWS)
-        self._levels = LevelTally(tags, _SAMPLE_ROWS)
-        superframe_s = self._first_fixes.superframe_s
-        self._superframes = (math.ceil(run.until_s / superframe_s - 1e-3) - int(run.warmup_s / superframe_s)) * tags
-
-    def add(self, tag: int, time_s: float, fix: Fix, truth_m: Array) -> None:
-        if time_s < self._from_s or not self._first_fixes.is_first(tag, time_s):
-            return
-        error_m = fix.position_m - truth_m
-        self._levels.add(tag, fix, error_m)
-        error = error_m[: self._dim]
-        covariance = fix.covariance_m2[: self._dim, : self._dim]
-        squared = float(error @ error)
-        nees = float(error @ np.linalg.solve(covariance, error))
-        self._sums += (squared, float(np.trace(covariance)), nees / self._dim, nees > self._outside_chi2)
-        self._max_m = max(self._max_m, squared**0.5)
-        self._sample.add((squared**0.5,))
-
-    def result(self, messages: int, tag_s: float, cpu_s: float) -> RunResult:
-        squared_m2, variance_m2, nees, outside = self._sums.tolist()
-        return RunResult(
-            fixes=self._sample.seen,
-            superframes=self._superframes,
-            squared_m2=squared_m2,
-            variance_m2=variance_m2,
-            nees=nees,
-            outside=int(outside),
-            max_m=self._max_m,
-            sample_m=self._sample.rows[:, 0],
-            messages=messages,
-            tag_s=tag_s,
-            cpu_s=cpu_s,
-            levels=self._levels.counts(),
-        )
 
 
 class Heard(Struct, frozen=True):
@@ -166,17 +116,42 @@ def beacons_of(run: Run) -> Iterator[Heard]:
 
 def judged(run: Run, beacons: Iterable[Heard]) -> RunResult:
     """Let the tags of a world compute their positions from what they received, and judge them."""
-    receivers = [AnyReceiver(run.method, integrity=run.integrity) for _ in run.trajectories]
-    tally, messages, cpu_s = _Tally(run), 0, 0.0
+    tags, dim = len(run.trajectories), 2 if run.site.tags.height_m is not None else 3
+    receivers = [AnyReceiver(run.method) for _ in run.trajectories]
+    first_fixes, levels = FirstFixes(run.site, tags), LevelTally(tags, _SAMPLE_ROWS)
+    sums, max_m, sample, outside_chi2 = np.zeros(4), 0.0, EvenSample(1, _SAMPLE_ROWS), float(chi2.ppf(_OUTSIDE, dim))
+    messages, cpu_s = 0, 0.0
     for beacon in beacons:
         begun_s = time.thread_time()
         fixes = [receivers[tag].hear(reception) for tag, reception, _ in beacon.receptions]
         cpu_s += time.thread_time() - begun_s
         messages += len(fixes)
         for (tag, _, truth_m), fix in zip(beacon.receptions, fixes, strict=True):
-            if fix is not None:
-                tally.add(tag, beacon.end_s, fix, truth_m)
-    return tally.result(messages, run.until_s * len(receivers), cpu_s)
+            if fix is None or beacon.end_s < run.warmup_s or not first_fixes.is_first(tag, beacon.end_s):
+                continue
+            error_m = fix.position_m - truth_m
+            levels.add(tag, fix, error_m)
+            error, covariance = error_m[:dim], fix.covariance_m2[:dim, :dim]
+            squared, nees = float(error @ error), float(error @ np.linalg.solve(covariance, error))
+            sums += (squared, float(np.trace(covariance)), nees / dim, nees > outside_chi2)
+            max_m = max(max_m, squared**0.5)
+            sample.add((squared**0.5,))
+    superframe_s = first_fixes.superframe_s
+    squared_m2, variance_m2, sum_nees, outside = sums.tolist()
+    return RunResult(
+        fixes=sample.seen,
+        superframes=(math.ceil(run.until_s / superframe_s - 1e-3) - int(run.warmup_s / superframe_s)) * tags,
+        squared_m2=squared_m2,
+        variance_m2=variance_m2,
+        nees=sum_nees,
+        outside=int(outside),
+        max_m=max_m,
+        sample_m=sample.rows[:, 0],
+        messages=messages,
+        tag_s=run.until_s * tags,
+        cpu_s=cpu_s,
+        levels=None if levels.risk is None else levels,
+    )
 
 
 def bound_m2(run: Run, biases: Biases) -> float:
@@ -185,8 +160,12 @@ def bound_m2(run: Run, biases: Biases) -> float:
     anchors_m = {one.id: position_m for one, position_m in zip(site.anchors, anchor_positions(site), strict=True)}
     for one in noise.anchor_displacements:
         anchors_m[one.anchor] = anchors_m[one.anchor] + (one.x_m, one.y_m, one.z_m)
+    of_tags: list[list[tuple[Broadcast, Array]]] = [[] for _ in run.trajectories]
+    for broadcast in world_of(site, run.trajectories, noise, run.seed).run(run.until_s):
+        for tag, position_m in zip(broadcast.tags.tolist(), broadcast.positions_m, strict=True):
+            of_tags[tag].append((broadcast, position_m))
     means = []
-    for received in _received(run):
+    for received in of_tags:
         beacons = [beacon for one, _ in received if isinstance(beacon := decode_cached(one.frame), Beacon)]
         times_s = np.array([broadcast.emission_s for broadcast, _ in received])
         path_m = np.array([position_m for _, position_m in received])
@@ -233,15 +212,6 @@ def bounds_m2(
     return np.asarray(np.trace(bound, axis1=1, axis2=2))
 
 
-def _received(run: Run) -> list[list[tuple[Broadcast, Array]]]:
-    """What each tag of a world received, and where it was then."""
-    received: list[list[tuple[Broadcast, Array]]] = [[] for _ in run.trajectories]
-    for broadcast in world_of(run.site, run.trajectories, run.impairments, run.seed).run(run.until_s):
-        for tag, position_m in zip(broadcast.tags.tolist(), broadcast.positions_m, strict=True):
-            received[tag].append((broadcast, position_m))
-    return received
-
-
 def large_lab_site(noise_ps: float) -> Site:
     """The lab at 15 m × 20 m: space for 5 m/s, and the same dilution of precision at the corresponding positions."""
     lab = paper_lab_site(noise_ps)
@@ -252,11 +222,7 @@ def large_lab_site(noise_ps: float) -> Site:
 def walking(plan: Plan, site: Site | None = None, **options: Any) -> tuple[Run, ...]:  # noqa: ANN401 - of ``worlds``
     """Worlds of the lab, or another site, with tags that walk at 1 m/s from point to point."""
     in_site = site or paper_lab_site(plan.noise_ps)
-
-    def paths(seed: int) -> Sequence[Trajectory]:
-        return trajectories_of(Request(in_site, seed=seed, tags=plan.tags))
-
-    return worlds(plan, in_site, paths, **options)
+    return worlds(plan, in_site, lambda seed: trajectories_of(Request(in_site, seed=seed, tags=plan.tags)), **options)
 
 
 def worlds(
@@ -270,7 +236,6 @@ def worlds(
     seconds: float | None = None,
     count: int | None = None,
     lost_at_tags: float = 0.0,
-    integrity: IntegrityRequirement = IntegrityRequirement(),  # noqa: B008 - a frozen value
     **faults: Any,  # noqa: ANN401 - of a Request
 ) -> tuple[Run, ...]:
     """Worlds of a case; those of the same number have the same seed in all cases of a study.
@@ -294,7 +259,6 @@ def worlds(
                 warmup_s=warmup_s,
                 until_s=warmup_s + (seconds or plan.seconds),
                 lost_at_tags=lost_at_tags,
-                integrity=integrity,
             )
         )
     return tuple(runs)

@@ -91,7 +91,8 @@ class ErrorStatistics:
     def __init__(self, *, planar: bool) -> None:
         """``planar``: percentiles and maximum refer to the horizontal error, as the height was given."""
         self._planar = planar
-        self._count = 0
+        self.count = 0
+        """Number of errors."""
         self._origin = (0.0, 0.0, 0.0)
         """The first vector: sums are relative to it, so that no digits are lost far from the site's origin."""
         self._sum = [0.0, 0.0, 0.0]
@@ -101,9 +102,9 @@ class ErrorStatistics:
 
     def add(self, x_m: float, y_m: float, z_m: float) -> None:
         """Add one error vector."""
-        if self._count == 0:
+        if self.count == 0:
             self._origin = (x_m, y_m, z_m)
-        self._count += 1
+        self.count += 1
         for axis, value in enumerate((x_m, y_m, z_m)):
             offset = value - self._origin[axis]
             self._sum[axis] += offset
@@ -112,52 +113,25 @@ class ErrorStatistics:
         self._max = max(self._max, error_m)
         self._sample.add((error_m,))
 
-    @property
-    def count(self) -> int:
-        """Number of errors."""
-        return self._count
-
-    def std(self) -> tuple[float, float, float]:
-        """Standard deviation of each component."""
-        x, y, z = (variance**0.5 for variance in self._variances())
-        return x, y, z
-
-    def _variances(self) -> list[float]:
-        count = self._count
-        return [
-            max(square / count - (total / count) ** 2, 0.0)
-            for square, total in zip(self._squares, self._sum, strict=True)
-        ]
-
     def summary(self) -> ErrorSummary:
         """Figures of all errors."""
-        if self._count == 0:
+        count = self.count
+        if count == 0:
             return ErrorSummary(0, None, None, None, None, None)
-        x_m, y_m, z_m = (start + total / self._count for start, total in zip(self._origin, self._sum, strict=True))
+        x_m, y_m, z_m = (start + total / count for start, total in zip(self._origin, self._sum, strict=True))
         means_m = (x_m, y_m, z_m)
-        mean_squares = [mean**2 + variance for mean, variance in zip(means_m, self._variances(), strict=True)]
+        mean_squares = [
+            mean**2 + max(square / count - (total / count) ** 2, 0.0)
+            for mean, square, total in zip(means_m, self._squares, self._sum, strict=True)
+        ]
         return ErrorSummary(
-            count=self._count,
+            count=count,
             rmse_2d_m=(mean_squares[0] + mean_squares[1]) ** 0.5,
             rmse_3d_m=None if self._planar else sum(mean_squares) ** 0.5,
             p95_m=float(np.percentile(self._sample.rows, 95)),
             max_m=self._max,
             bias_m=means_m,
         )
-
-
-class LevelCounts(Struct, frozen=True):
-    """Protection levels of each tag's judged fixes; counts have shape (tags,)."""
-
-    fixes: Array
-    levels: Array
-    """Fixes with a horizontal protection level."""
-    exceeded: Array
-    """Those of them whose horizontal error exceeds it."""
-    unwarned: Array
-    """Those of them without an alert."""
-    hpl_m: Array
-    """An even sample of the levels."""
 
 
 class LevelReport(Struct, frozen=True):
@@ -178,8 +152,10 @@ class LevelTally:
     """Counts fixes by their protection levels and whether these held."""
 
     def __init__(self, tags: int, sample_rows: int) -> None:
-        self._risk: float | None = None
-        self._counts = np.zeros((4, tags))
+        self.risk: float | None = None
+        """As the fixes state it; None if none was judged or the method has no levels."""
+        self.fixes, self.levels, self.exceeded, self.unwarned = np.zeros((4, tags))
+        """Of each tag: judged fixes, of these with a horizontal level, of these beyond it, of these without alert."""
         self._misleading = 0
         self._alerts: Counter[str] = Counter()
         self._sample = EvenSample(1, sample_rows)
@@ -189,34 +165,33 @@ class LevelTally:
         integrity = fix.integrity
         if integrity is None:
             return
-        self._risk = fix.integrity_risk
+        self.risk = fix.integrity_risk
         self._alerts[integrity.alert.value] += 1
-        self._counts[0, tag] += 1
+        self.fixes[tag] += 1
         hpl_m, vpl_m = integrity.hpl_m, integrity.vpl_m
         if hpl_m is None:
             return
         self._sample.add((hpl_m,))
-        self._counts[1, tag] += 1
+        self.levels[tag] += 1
         exceeded = math.hypot(error_m[0], error_m[1]) > hpl_m
         self._misleading += exceeded or (vpl_m is not None and bool(abs(error_m[2]) > vpl_m))
         if exceeded:
-            self._counts[2, tag] += 1
-            self._counts[3, tag] += integrity.alert is Alert.NONE
+            self.exceeded[tag] += 1
+            self.unwarned[tag] += integrity.alert is Alert.NONE
 
-    def counts(self) -> LevelCounts | None:
-        """Counts by tag; None if no fix was judged or the method has no levels."""
-        if self._risk is None:
-            return None
-        fixes, levels, exceeded, unwarned = self._counts
-        return LevelCounts(fixes, levels, exceeded, unwarned, self._sample.rows[:, 0])
+    @property
+    def hpl_m(self) -> Array:
+        """An even sample of the horizontal levels."""
+        return self._sample.rows[:, 0]
 
     def report(self) -> LevelReport | None:
         """Report of all tags together; None if no fix was judged or the method has no levels."""
-        if self._risk is None:
+        if self.risk is None:
             return None
-        fixes, levels = self._counts[:2].sum(axis=1).tolist()
-        median_m = float(np.median(self._sample.rows)) if levels else None
-        return LevelReport(self._risk, levels / fixes, self._misleading, median_m, dict(sorted(self._alerts.items())))
+        levels = float(self.levels.sum())
+        median_m = float(np.median(self.hpl_m)) if levels else None
+        available = levels / float(self.fixes.sum())
+        return LevelReport(self.risk, available, self._misleading, median_m, dict(sorted(self._alerts.items())))
 
 
 # The truth of a recording: carried to the antenna, interpolated, and shifted in time.

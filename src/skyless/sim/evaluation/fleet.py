@@ -9,7 +9,7 @@ import numpy as np
 from msgspec import Struct
 
 from skyless.core.air.frame import Reception
-from skyless.core.any_anchor import AnchorMachine, new_anchor
+from skyless.core.any_anchor import new_anchor
 from skyless.core.any_receiver import AnyReceiver, SiteBeacon
 from skyless.core.arrays import Array
 from skyless.core.fix import Fix, NoFixReason
@@ -125,9 +125,6 @@ def world_of(site: Site, trajectories: Sequence[Trajectory], impairments: Impair
 class TagFleet:
     """Computing tags and their errors; ``Fleet`` and ``TapeFleet`` differ in how tags receive."""
 
-    step_s = 0.25
-    """Suitable true time per call of ``run``."""
-
     def __init__(self, site: Site, tags: int, settings: FleetSettings) -> None:
         self._settings = settings
         self.site = site
@@ -137,20 +134,6 @@ class TagFleet:
         self.errors = ErrorStatistics(planar=site.tags.height_m is not None)
         self.sigma_squared_sum = 0.0
         self.levels = LevelTally(tags, _LEVEL_ROWS)
-
-    @property
-    def now_s(self) -> float:
-        """The present true time."""
-        raise NotImplementedError
-
-    @property
-    def tally(self) -> Tally:
-        """Counts of what was on the air."""
-        raise NotImplementedError
-
-    def run(self, until_s: float) -> Iterator[JudgedFix]:
-        """Advance true time. Yields every fix of every tag, with the truth."""
-        raise NotImplementedError
 
     def _new_receiver(self) -> TagReceiver:
         asked = self._settings
@@ -198,6 +181,9 @@ class TagFleet:
 class Fleet(TagFleet):
     """Tags listening in a world; each frame on the air becomes fixes."""
 
+    step_s = 0.25
+    """Suitable true time per call of ``run``."""
+
     def __init__(
         self,
         site: Site,
@@ -207,30 +193,24 @@ class Fleet(TagFleet):
         settings: FleetSettings,
     ) -> None:
         super().__init__(site, len(trajectories), settings)
-        self.anchors: dict[int, AnchorMachine] = {}
-        specs = [TagSpec(trajectory) for trajectory in trajectories]
         errors = settings.motion
         self.sensors = [
             [] if errors is None else [MotionSensor(path, errors, seed, tag)] for tag, path in enumerate(trajectories)
         ]
-        self.world = World(site, self._new_anchor, specs, impairments, seed)
-
-    def _new_anchor(self, anchor: int) -> AnchorMachine:
-        self.anchors[anchor] = new_anchor(self.site, anchor)
-        return self.anchors[anchor]
+        self.world = world_of(site, trajectories, impairments, seed)
 
     @property
     def now_s(self) -> float:
-        """See ``TagFleet``."""
+        """The present true time."""
         return self.world.now_s
 
     @property
     def tally(self) -> Tally:
-        """See ``TagFleet``."""
+        """Counts of what was on the air."""
         return self.world.tally
 
     def run(self, until_s: float) -> Iterator[JudgedFix]:
-        """See ``TagFleet``."""
+        """Advance true time. Yields every fix of every tag, with the truth."""
         for broadcast in self.world.run(until_s):
             for tag, reception, truth_m in broadcast.receptions():
                 for sensor in self.sensors[tag]:
@@ -262,12 +242,8 @@ class TapeFleet(TagFleet):
         """
         super().__init__(site, len(trajectories), settings)
         self.tape = Tape(site, trajectories, impairments, seed, survey_std_m=survey_std_m)
-        self._now_s = 0.0
-
-    @property
-    def now_s(self) -> float:
-        """See ``TagFleet``."""
-        return self._now_s
+        self.now_s = 0.0
+        """The present true time."""
 
     @property
     def tally(self) -> Tally:
@@ -275,16 +251,19 @@ class TapeFleet(TagFleet):
         return Tally(0, 0, {}, {str(Outcome.HEARD): sum(record.messages for record in self.records)})
 
     def run(self, until_s: float) -> Iterator[JudgedFix]:
-        """See ``TagFleet``; tag by tag within each half second."""
-        while self._now_s < until_s:
-            end_s = min(self._now_s + self.step_s, until_s)
+        """Advance true time, tag by tag within each half second. Yields every fix of every tag, with the truth."""
+        while self.now_s < until_s:
+            end_s = min(self.now_s + self.step_s, until_s)
             for tag, receiver in enumerate(self.receivers):
-                for heard in self.tape.hear(tag, self._now_s, end_s):
+                for heard in self.tape.hear(tag, self.now_s, end_s):
                     fix = receiver.hear_beacon(heard.beacon, heard.reception)
                     judged = self.add(tag, fix, heard.truth_m, heard.reception.host_s or 0.0)
                     if judged is not None:
                         yield judged
-            self._now_s = end_s
+            self.now_s = end_s
+
+
+AnyFleet = Fleet | TapeFleet
 
 
 class FleetReport(Struct, frozen=True):
@@ -319,7 +298,7 @@ class FleetReport(Struct, frozen=True):
     """Simulated seconds per second."""
 
 
-def report(fleet: TagFleet, method: str, started_s: float) -> FleetReport:
+def report(fleet: AnyFleet, method: str, started_s: float) -> FleetReport:
     """Summarise a run; ``started_s`` is ``time.perf_counter()`` at its start."""
     wall_s = time.perf_counter() - started_s
     summary = fleet.errors.summary()

@@ -18,8 +18,8 @@ from skyless.arguments import (
     Seed,
     Text,
     check_number,
-    check_point,
     number,
+    points,
     read_numbers,
     read_points,
     sequence,
@@ -139,11 +139,7 @@ def _check_fault(name: str, fault: Any) -> None:  # noqa: ANN401 - of any kind
         check_number(f"{name}.burst_s", burst_s, above=0.0)
 
 
-def _check_positions(name: str, values: Any) -> tuple[tuple[float, ...], ...]:  # noqa: ANN401 - what a user gives
-    found = sequence(name, values, "points, (x, y) or (x, y, z) in metres each")
-    return tuple(
-        check_point(f"{name}[{index}]", point_m, (2, 3), MAX_COORDINATE_M) for index, point_m in enumerate(found)
-    )
+_POINTS: Final = points(2, 3, form="points, (x, y) or (x, y, z)", farthest_m=MAX_COORDINATE_M)
 
 
 def _check_paths(name: str, values: Any) -> tuple[tuple[tuple[float, ...], ...], ...]:  # noqa: ANN401
@@ -152,7 +148,7 @@ def _check_paths(name: str, values: Any) -> tuple[tuple[tuple[float, ...], ...],
 
 
 def _checked_path(name: str, path_m: Sequence[Sequence[float]]) -> tuple[tuple[float, ...], ...]:
-    points_m = _check_positions(name, path_m)
+    points_m: tuple[tuple[float, ...], ...] = _POINTS.check(name, path_m)
     if len(points_m) < 2:
         raise wrong(name, path_m, "two or more points, x,y or x,y,z in metres each")
     if len({len(point_m) for point_m in points_m}) > 1:
@@ -172,7 +168,7 @@ class Conditions(ProtectionOptions, frozen=True, kw_only=True):
         "Sequence[Sequence[float]]",
         Option("position"),
         Text(lambda name, text: read_numbers(name, text, (2, 3)), "x,y or x,y,z", many=True),
-        Rule(_check_positions),
+        _POINTS,
     ] = ()
     """Where tags lie still, x, y or x, y, z in metres each."""
     paths_m: Annotated[

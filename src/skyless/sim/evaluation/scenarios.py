@@ -15,7 +15,7 @@ from skyless.core.errors import SkylessError
 from skyless.core.geometry import rectangle_of
 from skyless.core.method_names import DEFAULT_METHOD, FILTERS, SNAPSHOTS
 from skyless.core.site import FloorSite, Site
-from skyless.sim.evaluation.fleet import Fleet, FleetSettings, JudgedFix, TagFleet, TagReceiver, TapeFleet
+from skyless.sim.evaluation.fleet import AnyFleet, Fleet, FleetSettings, JudgedFix, TagReceiver, TapeFleet
 from skyless.sim.evaluation.request import Conditions
 from skyless.sim.impairments import AnchorDisplacement, Body, CarrierModel, Impairments, RangeErrorModel, WarmUp
 from skyless.sim.motion_sensor import MotionErrors
@@ -150,18 +150,18 @@ def fleet_of(request: Request) -> Fleet:
     """Create the world and its tags; the anchors are the machines that would run on radios.
 
     Raises:
-        ValueError: an anchor that is to fail does not exist, or the method needs a master and the site has none.
+        SkylessError: tags of the site can have no fixes by the method.
+        ValueError: an anchor that is to fail does not exist.
     """
     site = request.site
-    if request.method in SNAPSHOTS and not site.schedule.needs_master:
-        raise ValueError(f"the method {request.method} needs a master, and site {site.name} has none")
+    check_can_be_simulated(site, request.method)
     if request.noise_ps is not None:
         noise = replace(site.noise, tx_stamp_ps=request.noise_ps, rx_stamp_ps=request.noise_ps)
         site = replace(site, noise=noise)
     return Fleet(site, trajectories_of(request), impairments_of(request, site), request.seed, _settings(request))
 
 
-def fleet_of_any_size(request: Request) -> TagFleet:
+def fleet_of_any_size(request: Request) -> AnyFleet:
     """Like ``fleet_of``, but the anchors of a large site of protocol 2 are a tape.
 
     Raises:
@@ -171,24 +171,21 @@ def fleet_of_any_size(request: Request) -> TagFleet:
     if site.schedule.needs_master or len(site.anchors) <= MAX_MACHINES:
         return fleet_of(request)
     faults = impairments_of(request, site)
-    unfit = [
-        name
-        for name, given in (
-            ("--outage", request.outages),
-            ("--bias", request.biases),
-            ("--delay-error", request.delay_errors),
-            ("--silence", request.silences),
-            ("--nlos", request.nlos),
-            ("--temperature", request.temperature),
-            ("--carrier", request.carrier),
-            ("--carries", request.carries),
-            ("walls of the site file", site.walls),
-            ("floors of the site file", site.storeys[1:]),
-        )
-        if given
-    ]
-    if unfit:
-        raise ValueError(f"{unfit[0]}: not modelled at a site of more than {MAX_MACHINES} anchors")
+    unfit = {
+        "--outage": request.outages,
+        "--bias": request.biases,
+        "--delay-error": request.delay_errors,
+        "--silence": request.silences,
+        "--nlos": request.nlos,
+        "--temperature": request.temperature,
+        "--carrier": request.carrier,
+        "--carries": request.carries,
+        "walls of the site file": site.walls,
+        "floors of the site file": site.storeys[1:],
+    }
+    for name, given in unfit.items():
+        if given:
+            raise ValueError(f"{name}: not modelled at a site of more than {MAX_MACHINES} anchors")
     return TapeFleet(
         site,
         trajectories_of(request),
@@ -247,7 +244,10 @@ def trajectories_of(request: Request) -> list[Trajectory]:
     """
     height_m = request.site.tags.height_m or 0.0
     given: list[Trajectory] = [Static(*_with_height(point, height_m)) for point in request.positions_m]
-    given += [_path([_with_height(p, height_m) for p in path], request.speed_mps or 1.0) for path in request.paths_m]
+    for path in request.paths_m:
+        points = [_with_height(point, height_m) for point in path]
+        is_closed = len(points) > 2 and points[0] == points[-1]
+        given.append(_smooth_path(points[:-1] if is_closed else points, request.speed_mps or 1.0, loop=is_closed))
     if given or request.room is None or request.room.is_stated:
         return given or [_walk(request, index) for index in range(request.tags or 1)]
     return wanderers(request.site, request.tags or 1, request.seed)
@@ -287,11 +287,6 @@ def wanderer(low_m: Array, high_m: Array, seed: int, tag: int, qa_m2ps3: float =
 
 def _with_height(point: Sequence[float], height_m: float) -> tuple[float, float, float]:
     return point[0], point[1], point[2] if len(point) > 2 else height_m
-
-
-def _path(points: list[tuple[float, float, float]], speed_mps: float) -> Waypoints:
-    closed = len(points) > 2 and points[0] == points[-1]
-    return _smooth_path(points[:-1] if closed else points, speed_mps, loop=closed)
 
 
 def _walk(request: Request, index: int) -> Trajectory:
@@ -373,7 +368,7 @@ _LONGEST_WAIT_S: Final = 60.0
 
 
 def run_fleet(
-    fleet: TagFleet,
+    fleet: AnyFleet,
     request: Request,
     until_s: float,
     on_fix: Callable[[JudgedFix], None] | None,
@@ -389,7 +384,7 @@ def run_fleet(
         on_progress(now_s / until_s if fixes is None else fleet.errors.count / len(fleet.records) / fixes)
 
 
-def _is_enough(fleet: TagFleet, request: Request, now_s: float) -> bool:
+def _is_enough(fleet: AnyFleet, request: Request, now_s: float) -> bool:
     """Whether all tags have their fixes, or the others have waited too long with no planned return."""
     fixes = request.fixes
     if fixes is None:
