@@ -47,7 +47,7 @@ def test_a_recording_of_tags_holds_their_anchors_ranges(tmp_path):
     record(path, messages(3.0, method="weighted"))
     shares = []
     found = ranges_of(path, on_progress=shares.append)
-    assert (found.format, found.site) == ("skyless-mcap", SITE)
+    assert (found.is_foreign, found.site) == (False, SITE)
     assert len(found.ranger.ranges().pairs) == 15
     assert min(pair.exchanges for pair in found.ranger.ranges().pairs) > 150
     assert np.abs(_errors(found.ranger.ranges())).max() < 4.5
@@ -128,7 +128,7 @@ def test_a_sniffers_capture_holds_its_anchors_ranges(tmp_path):
     path = tmp_path / "sniffer.txt"
     path.write_bytes(text)
     found = ranges_of(path)
-    assert (found.format, found.site) == ("bitcraze-text", None)
+    assert (found.is_foreign, found.site) == (True, None)
     assert [(pair.a, pair.b) for pair in found.ranger.ranges().pairs] == [(1, 2), (1, 3), (2, 3)]
     assert min(pair.exchanges for pair in found.ranger.ranges().pairs) > 320
     # The delays are subtracted as whole ticks.

@@ -163,13 +163,6 @@ def test_stamps_of_strangers_are_dropped_and_a_restarted_counter_harms_no_range(
         assert abs(pair.range_m - ((xa - xb) ** 2 + (ya - yb) ** 2) ** 0.5) < 0.6
 
 
-def test_facts_of_other_anchors_are_dropped():
-    live = LiveSurvey(FRESH, Facts())
-    facts = Facts(heights_m={1: 2.0, 9: 3.0}, tapes=(Tape(1, 9, 3.0), Tape(1, 2, 6.0)), gauge=Gauge(1, 9))
-    live.set_facts(facts)
-    assert live.facts == replace(facts, heights_m={1: 2.0}, tapes=(Tape(1, 2, 6.0),), gauge=None)
-
-
 class Stage:
     """The program with a fake link, a clock that the test sets, and a solver that knows the truth."""
 
@@ -177,9 +170,10 @@ class Stage:
         self.now_s, self.said, self.asked = BEGIN_S, [], []
         monkeypatch.setattr(program_module, "Link", FakeLink)
         monkeypatch.setattr(program_module, "time", SimpleNamespace(monotonic=lambda: self.now_s, time=lambda: 1e9))
+        monkeypatch.setattr(program_module, "run_survey", self.solve)
         self.found = true_survey()
         self.node = SurveyNode(
-            SurveySettings(1, **settings), lambda _: Facts(), self.solve, MqttAddress("127.0.0.1", 1), self.said.append
+            SurveySettings(1, **settings), lambda _: Facts(), MqttAddress("127.0.0.1", 1), self.said.append
         )
         self.link = self.node.link
 
@@ -433,7 +427,7 @@ def test_where_not_all_files_can_be_written_none_is(tmp_path, monkeypatch, faili
 
 async def test_a_finding_is_logged_once_although_its_size_wavers():
     said, again = [], []
-    node = SurveyNode(SurveySettings(1), lambda _: Facts(), None, MqttAddress("127.0.0.1", 1), said.append)
+    node = SurveyNode(SurveySettings(1), lambda _: Facts(), MqttAddress("127.0.0.1", 1), said.append)
     node._next_publish_s = math.inf
     found = []
     node.live = SimpleNamespace(
@@ -476,10 +470,12 @@ def test_what_phases_show_is_found_beside_what_stamps_show():
 
 
 def test_ranges_count_from_the_delays_of_the_file_although_the_anchors_run_with_others():
-    node = SurveyNode(SurveySettings(1, FRESH), lambda _: Facts(), None, MqttAddress("127.0.0.1", 1), lambda _: None)
+    node = SurveyNode(SurveySettings(1, FRESH), lambda _: Facts(), MqttAddress("127.0.0.1", 1), lambda _: None)
     node.live = live_after(3.0)
-    before = {(pair.a, pair.b): pair.range_m for pair in node.final_ranges().pairs}
+    node.live.ranger.finish()
+    before = {(pair.a, pair.b): pair.range_m for pair in node.live.ranges().pairs}
     more = replace(FRESH, unplaced=tuple(replace(one, tx_antenna_delay_ticks=16536) for one in FRESH.unplaced))
     node._on_site(mqtt.SiteMessage(more, simulated=True, unix_s=0.0))
-    for pair in node.final_ranges().pairs:  # with smaller delays they are longer, by 50 ticks of each anchor
+    # With smaller delays ranges are longer, by 50 ticks of each anchor.
+    for pair in node.live.ranges().without_delays(node.delays_m).pairs:
         assert pair.range_m - before[pair.a, pair.b] == pytest.approx(100 * 0.00469176, abs=1e-5)

@@ -7,7 +7,7 @@ import pytest
 from msgspec import structs
 
 from skyless.core.errors import SkylessError
-from skyless.site.survey.facts import Facts, PairRange, PairRanges, Tape
+from skyless.site.survey.facts import Facts, Gauge, PairRange, PairRanges, Tape
 from skyless.site.survey.legs import mean_ranges
 from skyless.site.survey.pair_ranger import PairRanger
 from skyless.site.survey.solve import run_survey
@@ -38,6 +38,15 @@ def test_facts_that_cannot_be_are_named_and_not_used(positions, facts, note):
     assert any(one.startswith(note) and one.endswith("not used") for one in survey.notes)
     without = run_survey(RANGES, Facts(**positions))
     assert [one.x_m for one in survey.anchors] == [one.x_m for one in without.anchors]
+
+
+def test_facts_of_other_anchors_are_named_and_not_used():
+    """A site's facts may be older than its list of anchors."""
+    facts = Facts(heights_m={1: 2.0, 9: 3.0}, tapes=(Tape(1, 9, 3.0),), points={8: (0.0, 0.0, None)}, gauge=Gauge(1, 9))
+    survey = run_survey(RANGES, facts)
+    for words in ("1 and 9 fits no pair", "anchor 8, which", "anchor 9, which", "anchor 9 has"):
+        assert any(words in note for note in survey.notes), words
+    assert all(one.determined for one in survey.anchors)
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, -1.0])

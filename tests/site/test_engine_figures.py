@@ -77,7 +77,7 @@ def test_errors_are_as_large_as_stated(name, delay_std_m, pair_std_m, tapes, mos
     squares, freedom, stated = 0.0, 0, []
     for run in range(RUNS):
         ranges, facts, _ = drawn(layout, run, delay_std_m=delay_std_m, pair_std_m=pair_std_m, tapes=tapes)
-        problem, _ = build_problem(usable(ranges, facts), everyone, pair_std_m, None, None)
+        problem, _ = build_problem(usable(ranges, facts), everyone)
         solution = solve_least_squares(problem, layout.position_m)
         core = np.ones(len(everyone), bool)
         covariance = aligned_covariance(problem, layout.position_m, core)
@@ -100,7 +100,7 @@ def test_delays_are_as_good_as_stated(name):
     for run in range(RUNS):
         ranges, facts, delays = drawn(layout, run, delay_std_m=0.07, pair_std_m=0.02)
         measured = usable(ranges, facts)
-        problem, _ = build_problem(measured, everyone, 0.02, None, None)
+        problem, _ = build_problem(measured, everyone)
         solution = solve_least_squares(problem, layout.position_m)
         covariance = aligned_covariance(problem, layout.position_m, np.ones(len(everyone), bool))
         of_delays = covariance[3 * len(everyone) :, 3 * len(everyone) :]

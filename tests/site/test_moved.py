@@ -9,6 +9,7 @@ import pytest
 
 from skyless.cli.main import main
 from skyless.core.ticks import TICK_M, TICK_RATE_HZ
+from skyless.research.calibration.biases import Gathered
 from skyless.run.mqtt.address import MqttAddress
 from skyless.run.survey.program import LiveSurvey, SurveyNode, SurveySettings
 from skyless.sim.lab import lab_site
@@ -54,7 +55,7 @@ def test_surveys_at_rest_raise_no_alarm(places):
         for seconds in (10, 30, 60):
             for drift_m in (0.0, 0.02):
                 table = gathered(places, seconds, seed, drift_m=drift_m)
-                assert change_of(table, FACTS, run_survey) is None, (seed, seconds, drift_m)
+                assert change_of(table, FACTS) is None, (seed, seconds, drift_m)
 
 
 def test_people_who_walk_through_links_and_late_links_are_no_motion():
@@ -67,7 +68,7 @@ def test_people_who_walk_through_links_and_late_links_are_no_motion():
         )
 
     for seed in range(6):
-        assert change_of(gathered(LAB, 60, seed, late_m=crossing), FACTS, run_survey) is None
+        assert change_of(gathered(LAB, 60, seed, late_m=crossing), FACTS) is None
 
 
 @pytest.mark.parametrize("places", [LAB, HALL])
@@ -83,7 +84,7 @@ def test_a_moved_anchor_is_named_with_its_distance(places, seconds, moved_s):
             share = min(max((t_s - moved_s) / 2.0, 0.0), 1.0) if anchor == 5 else 0.0
             return tuple(np.array(places[anchor]) + share * step_m)
 
-        change = change_of(gathered(places, seconds, seed, at=at), FACTS, run_survey)
+        change = change_of(gathered(places, seconds, seed, at=at), FACTS)
         assert change is not None
         assert "anchor 5" in change.sentence
         assert moved_s + 1.0 <= change.since_s <= moved_s + 9.0
@@ -120,7 +121,7 @@ def test_a_survey_is_that_of_the_time_since_the_motion():
     ranger.finish()
     facts = Facts(heights_m=dict.fromkeys(LAB, 0.0), delay_std_m=0.0, gauge=Gauge(1, 2, 4))
     averaged = run_survey(ranger.ranges(), facts)
-    (change,) = drop_moved(ranger, facts, run_survey)
+    (change,) = drop_moved(ranger, facts)
     assert "anchor 4 has moved by about" in change.sentence
     ranges = ranger.ranges()
     assert 9.0 < ranges.duration_s < 18.0
@@ -134,12 +135,12 @@ def test_a_live_survey_goes_on_with_the_time_since_the_motion():
     live = LiveSurvey(site, Facts(heights_m=dict.fromkeys(LAB, 0.0)))
     for sender, receiver, tx_ticks, rx_ticks, t_s in legs(LAB, 30.0, hung_elsewhere):
         live._add(AnchorLeg(sender, receiver, tx_ticks, rx_ticks, t_s), t_s)
-    live.finish()
+    live.ranger.finish()
     live.add_result(run_survey(live.ranges(), live.facts), live.ranges())
-    change = change_of(live.steps(), live.facts, run_survey)
+    change = change_of(live.ranger.steps.table(), live.facts)
     live.use_since(change)
     assert live.result(1) is None  # an average of before and since
-    assert change_of(live.steps(), live.facts, run_survey) is None
+    assert change_of(live.ranger.steps.table(), live.facts) is None
     live.add_result(run_survey(live.ranges(), live.facts), live.ranges())
     note = live.result(2)[0].notes[0]
     assert note.startswith("during the survey anchor 4 has moved by about")
@@ -149,18 +150,18 @@ def test_a_live_survey_goes_on_with_the_time_since_the_motion():
 def test_the_program_and_the_command_use_the_time_since_the_motion(monkeypatch, capsys):
     ranger, site, lines = PairRanger(), lab_site(), []
     address = MqttAddress("127.0.0.1", 1)
-    node = SurveyNode(SurveySettings(site.id, site), lambda _: Facts(), run_survey, address, lines.append)
+    node = SurveyNode(SurveySettings(site.id, site), lambda _: Facts(), address, lines.append)
     live = node.live = LiveSurvey(site, Facts(heights_m=dict.fromkeys(LAB, 0.0)))
     for sender, receiver, tx_ticks, rx_ticks, t_s in legs(LAB, 30.0, hung_elsewhere):
         live._add(AnchorLeg(sender, receiver, tx_ticks, rx_ticks, t_s), t_s)
         ranger.add(sender, receiver, tx_ticks, rx_ticks, t_s)
-    live.finish()
+    live.ranger.finish()
     asyncio.run(node._make_result(live))
     assert live.result(live.serial)[0].notes[0].startswith("during the survey anchor 4 has moved by about")
     assert any("anchor 4 has moved by about" in line for line in lines)
 
     ranger.finish()
-    monkeypatch.setattr("skyless.cli.survey._gather_live", lambda *_: (site, ranger.ranges, ranger))
+    monkeypatch.setattr("skyless.cli.survey._gather_live", lambda *_: Gathered(ranger, site))
     assert main(["survey", "--mqtt", "mqtt://127.0.0.1", "--json"]) == 0
     report = json.loads(capsys.readouterr().out)
     assert report["notes"][0].startswith("during the survey anchor 4 has moved by about")

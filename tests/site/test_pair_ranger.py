@@ -11,7 +11,7 @@ from scipy.stats import chi2
 
 from skyless.core.ticks import TICK_M, TICK_RATE_HZ
 from skyless.site.survey.legs import Leg, bracketed_flight_ticks, earliest_cluster, half_sample_mode
-from skyless.site.survey.pair_ranger import Legs, PairRanger, flights_of
+from skyless.site.survey.pair_ranger import LEGS, PairRanger, flights_of
 
 pytestmark = pytest.mark.site
 
@@ -73,14 +73,11 @@ def _errors_m(ranges):
 )
 def test_brackets_are_those_of_one_pair(rows):
     """Any legs: the same times of flight as the scalar function gives for the neighbours in order of time."""
-    pair, a, b, back = zip(*rows, strict=True) if rows else ((),) * 4
     scale = 100_000
-    a_ticks, b_ticks = np.array(a, np.int64) * scale, np.array(a, np.int64) * scale + np.array(b, np.int64)
-    legs = Legs(
-        np.array(pair, np.int64), a_ticks, b_ticks, np.array(back, bool), np.zeros(len(rows), bool), np.zeros(len(rows))
-    )
+    legs = np.array([(pair, a * scale, a * scale + b, back, False, 0.0) for pair, a, b, back in rows], LEGS)
+    pair, a_ticks, b_ticks, back = (legs[name] for name in ("pair", "a_ticks", "b_ticks", "is_back"))
     flights, _, _ = flights_of(legs, 1 << 40)
-    got = dict(zip(flights.leg.tolist(), flights.ticks.tolist(), strict=True))
+    got = dict(zip(flights["leg"].tolist(), flights["ticks"].tolist(), strict=True))
     for index, found in got.items():
         x, y = (a_ticks, b_ticks) if back[index] else (b_ticks, a_ticks)
         others = [k for k in range(len(rows)) if pair[k] == pair[index] and back[k] != back[index]]
@@ -263,7 +260,7 @@ def test_memory_does_not_grow_with_time():
 
     ranger = _ranged(_legs(10.0, 15, late_m=late_m), block_s=0.02)
     assert all(len(history.blocks) <= 256 for history in ranger._histories)
-    assert len(ranger._kept.pair) < 100
+    assert len(ranger._kept) < 100
     ranges = ranger.ranges()
     late = {(pair.a, pair.b): pair.late_share for pair in ranges.pairs}
     assert late[1, 3] == pytest.approx(0.1, abs=0.05)

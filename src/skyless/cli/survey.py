@@ -33,19 +33,17 @@ from skyless.cli.common import (
 from skyless.cli.nodes.options import MqttCa, SiteId, log, run_until_stopped
 from skyless.core.errors import SkylessError
 from skyless.core.site import Site
-from skyless.research.calibration.options import CalibrateOptions, SurveyOptions
+from skyless.research.calibration.options import CalibrateOptions, SurveyOptions, facts_of
 from skyless.run.find_site import find_site
 from skyless.run.mqtt.address import mqtt_address
 from skyless.run.process import run
 from skyless.site.file.load import load_site
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from skyless.cli.api.survey import SurveyResult
+    from skyless.research.calibration.biases import Gathered
     from skyless.run.survey.program import SurveyNode
-    from skyless.site.survey.facts import Count, Facts, PairRanges, Survey, SurveyedPair, TapeAdvice
-    from skyless.site.survey.pair_ranger import PairRanger
+    from skyless.site.survey.facts import Facts, Survey, SurveyedPair, TapeAdvice
 
 NOTHING_DETERMINED: Final = 1
 """Exit code of a survey without a position or a delay."""
@@ -111,11 +109,6 @@ class Output(JsonOptions, frozen=True, kw_only=True):
             )
         check_new(out, force=self.force)
 
-    def on_count(self, counted: "Count") -> None:
-        """Print the numbers of measurements and unknowns."""
-        if not self.json:
-            console().print(counted.sentence)
-
 
 @app.default
 @command
@@ -134,14 +127,14 @@ def survey(*, asked: SurveyOptions, live: LiveOptions, output: Output) -> int:
     if live.serve:
         run_until_stopped(_serve(live, asked))
         return 0
-    from skyless.cli.api.survey import Gathered, gathered, surveyed
+    from skyless.cli.api.survey import gathered, surveyed
 
     with progress_bar("surveying") as reach:
         if asked.recording is None:
-            given = Gathered(*_gather_live(live, asked))
+            given = _gather_live(live, asked)
         else:
             given = gathered(asked.recording, asked.site, None, reach)
-        found = surveyed(asked, given, output.on_count)
+        found = surveyed(asked, given)
     return report(found, output)
 
 
@@ -194,8 +187,9 @@ def _table(result: "Survey") -> str:
 
 
 def _show(found: "SurveyResult", written: tuple[str, ...]) -> None:
-    """Print the survey: first warnings about uncertainties, then tables and lines of text."""
+    """Print the survey: first its counts and warnings about uncertainties, then tables and lines of text."""
     survey, screen = found.survey, console()
+    screen.print(found.title(), markup=False)
     print_warnings(
         [
             *found.warnings,
@@ -271,18 +265,22 @@ def _tapes(tapes: Sequence["TapeAdvice"]) -> list[str]:
 # At a running site
 
 
-def _gather_live(asked: LiveOptions, known: SurveyOptions) -> "tuple[Site, Callable[[], PairRanges], PairRanger]":
-    """Gather ranges for some seconds: the site, its anchors' ranges, and their source. Raises SkylessError."""
+def _gather_live(asked: LiveOptions, known: SurveyOptions) -> "Gathered":
+    """Gather ranges for some seconds. Raises SkylessError."""
+    from skyless.research.calibration.biases import Gathered
+
     found: list[SurveyNode] = []
     run(_gather(asked, known, found))
     live = found[0].live if found else None
     if live is None:
         raise SkylessError(f"no site was found at {asked.mqtt}: its anchors are not there, or have not begun yet")
-    if not found[0].final_ranges().pairs:
+    live.ranger.finish()
+    given = Gathered(live.ranger, live.site, delays_m=found[0].delays_m)
+    if not given.ranges.pairs:
         raise SkylessError(
             f"the anchors of site {live.site.name!r} have no ranges at {asked.mqtt} yet; they should be running"
         )
-    return live.site, found[0].final_ranges, live.finish()
+    return given
 
 
 async def _serve(asked: LiveOptions, known: SurveyOptions) -> None:
@@ -303,7 +301,9 @@ async def _gather(asked: LiveOptions, known: SurveyOptions, found: "list[SurveyN
 async def _node(asked: LiveOptions, known: SurveyOptions, *, serves: bool) -> "SurveyNode":
     """Create the survey program. Raises SkylessError."""
     from skyless.run.survey.program import SurveyNode, SurveySettings
-    from skyless.site.survey.solve import run_survey
+
+    def facts(of_site: Site) -> "Facts":
+        return facts_of(known, (anchor.id for anchor in of_site.all_anchors), of_site)
 
     assert asked.mqtt is not None
     address = mqtt_address(asked.mqtt, asked.mqtt_ca)
@@ -311,19 +311,13 @@ async def _node(asked: LiveOptions, known: SurveyOptions, *, serves: bool) -> "S
     site = None if file is None else load_site(file)
     site_id = site.id if asked.site_id is None and site is not None else asked.site_id
     if site is not None:
-        _facts(known, site)  # refuses options that do not fit the site before the program serves
+        facts(site)  # refuses options that do not fit the site before the program serves
         if site_id != site.id:
             raise SkylessError(f"--site-id is {site_id}; the site of {known.site} is number {site.id}")
     if site_id is None:
         site_id = await find_site(address)
     settings = SurveySettings(site_id, site, file, serves)
-    return SurveyNode(settings, lambda one: _facts(known, one), run_survey, address, log)
-
-
-def _facts(known: SurveyOptions, site: Site) -> "Facts":
-    from skyless.research.calibration.options import facts_of
-
-    return facts_of(known, (anchor.id for anchor in site.all_anchors), site)
+    return SurveyNode(settings, facts, address, log)
 
 
 def _line(node: "SurveyNode", seconds: float | None) -> str:
@@ -357,15 +351,13 @@ def calibrate(asked: CalibrateOptions, *, output: Output) -> int:
     Ends with exit code 1 if no delay is determined.
     """
     output.check_files(asked.site, asked.file, asked.truth)
-    from skyless.cli.api.survey import SurveyResult, biases_of_other, delays_of_site
+    from skyless.cli.api.survey import SurveyResult, run_calibrate
     from skyless.run.recordings.recording import is_mcap
 
-    is_of_site = is_mcap(asked.file)
-    if output.out is not None and output.out.suffix.lower() != ".csv" and not is_of_site:
+    if output.out is not None and output.out.suffix.lower() != ".csv" and not is_mcap(asked.file):
         raise SkylessError(f"--out is {str(output.out)!r}; {_ONLY_A_TABLE}")
     with progress_bar("calibrating") as reach:
-        asked = replace(asked, progress=reach)
-        found = delays_of_site(asked, output.on_count) if is_of_site else biases_of_other(asked)
+        found = run_calibrate(replace(asked, progress=reach))
     if isinstance(found, SurveyResult):
         return report(found, output)
     if output.out is not None:

@@ -1,6 +1,6 @@
 """``skyless.survey_site``: anchors from their receptions; ``skyless.calibrate``: delays from a tag at known places."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -9,7 +9,6 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
-from msgspec import Struct
 from msgspec.structs import replace
 
 from skyless.arguments import Progress, python_function
@@ -19,7 +18,7 @@ from skyless.core.arrays import Integers, Vector
 from skyless.core.errors import SkylessError
 from skyless.core.site import Site
 from skyless.files import has_columns, read_head
-from skyless.research.calibration.biases import Biases, biases_of, known_tags, ranges_of, walk_of
+from skyless.research.calibration.biases import Biases, Gathered, biases_of, known_tags, ranges_of, walk_of
 from skyless.research.calibration.options import CalibrateOptions, SurveyOptions, Walk, calibration_facts, facts_of
 from skyless.research.replays.captures import known_truth
 from skyless.research.replays.site import recorded_site
@@ -29,7 +28,7 @@ from skyless.site.report import BLUE, GRID, INK, MUTED, ORANGE, RED, panel, repo
 from skyless.site.survey.facts import Count, Facts, PairRanges, Survey, SurveyedAnchor, count
 from skyless.site.survey.pair_ranger import PairRanger
 from skyless.site.survey.solve import run_survey
-from skyless.site.survey.surveyed_site import delay_differences_m, surveyed_text, unchanged_anchors
+from skyless.site.survey.surveyed_site import delay_differences_m, surveyed_text
 from skyless.site.survey.watch import drop_moved, with_changes
 from skyless.site.tables import RANGE_COLUMNS, calibrated_table, new_table, read_ranges
 
@@ -107,29 +106,6 @@ def _legend(survey: Survey, at_m: dict[int, tuple[float, float]], scale: float) 
     return "\n".join(parts)
 
 
-class Gathered(Struct, frozen=True):
-    """Input of a survey."""
-
-    site: Site | None
-    """The site of --site, else of the recording."""
-    ranges: Callable[[], PairRanges]
-    """Gives the ranges with the antenna delays of the site."""
-    ranger: PairRanger | None = None
-    """Source of the ranges, if their times are known."""
-    drops: tuple[str, ...] = ()
-    """Unusable parts of a recording, by reason."""
-    is_foreign: bool = False
-    """Whether the recording is of another system."""
-    delays_m: Mapping[int, float] = {}
-    """By how much half an anchor's delays differ between the recording and the site."""
-
-    def with_all_anchors(self) -> PairRanges:
-        """The ranges, and the site's anchors without ranges, as the survey reports them, too."""
-        ranges = self.ranges()
-        of_site: Sequence[int] = () if self.site is None else [anchor.id for anchor in self.site.all_anchors]
-        return replace(ranges, anchors=tuple(sorted({*ranges.anchors, *of_site})))
-
-
 class SurveyResult(Result, frozen=True, eq=False):
     """Positions and delays of n anchors."""
 
@@ -165,7 +141,8 @@ class SurveyResult(Result, frozen=True, eq=False):
     @property
     def unchanged(self) -> tuple[int, ...]:
         """Anchors of the site that the survey does not change."""
-        return () if self.site is None else unchanged_anchors(self.site, self.survey)
+        known = () if self.site is None else self.site.all_anchors
+        return tuple(anchor.id for anchor in known if anchor.id not in self.survey.determined)
 
     @property
     def summary(self) -> dict[str, Any]:
@@ -224,25 +201,17 @@ def gathered(
     """Read the ranges of a recording or table, and the site if known. Raises SkylessError."""
     present = None if site is None else site_of(site)[0]
     if has_columns(RANGE_COLUMNS, read_head(recording)):
-        table = read_ranges(recording)
-        return Gathered(present, lambda: table)
-    found = ranges_of(
-        recording, format_name, identifier=None if present is None else present.id, on_progress=on_progress
-    )
-    drops = tuple(f"left out: {number} × {reason}" for reason, number in found.drops.items())
-    recorded, ranger = found.site, found.ranger
-    if present is None or recorded is None:
-        return Gathered(present or recorded, ranger.ranges, ranger, drops, recorded is None)
-    half_m = delay_differences_m(recorded, present)
-    return Gathered(present, lambda: ranger.ranges().without_delays(half_m), ranger, drops, delays_m=half_m)
+        return Gathered(read_ranges(recording), present)
+    identifier = None if present is None else present.id
+    found = ranges_of(recording, format_name, identifier=identifier, on_progress=on_progress)
+    if present is None or found.site is None:
+        return replace(found, site=present or found.site)
+    return replace(found, site=present, delays_m=delay_differences_m(found.site, present))
 
 
-def surveyed(asked: SurveyOptions, given: Gathered, on_count: Callable[[Count], None]) -> SurveyResult:
-    """Run the survey; ``on_count`` is called before with the numbers of measurements and unknowns.
-
-    Raises SkylessError.
-    """
-    facts = facts_of(asked, given.with_all_anchors().anchors, given.site, is_foreign=given.is_foreign)
+def surveyed(asked: SurveyOptions, given: Gathered) -> SurveyResult:
+    """Run the survey. Raises SkylessError."""
+    facts = facts_of(asked, given.ranges.anchors, given.site, is_foreign=given.is_foreign)
     if asked.walks:
         if asked.recording is None or given.site is None or not is_mcap(asked.recording):
             raise SkylessError("--walk names a tag of a recording of skyless record")
@@ -253,29 +222,24 @@ def surveyed(asked: SurveyOptions, given: Gathered, on_count: Callable[[Count], 
                 if isinstance(walk, Walk)
             ]
         facts = replace(facts, tags=tuple(walks))
-    return solved(given, facts, asked.site, on_count)
+    return solved(given, facts, asked.site)
 
 
-def solved(
-    given: Gathered, facts: Facts, file: object, on_count: Callable[[Count], None], before_m: Mapping[int, float] = {}
-) -> SurveyResult:
+def solved(given: Gathered, facts: Facts, file: object, before_m: Mapping[int, float] = {}) -> SurveyResult:
     """Solve for what the facts leave open; ``before_m``: changes of delays by anchor that the tags' differences lack.
 
     ``file``: the site's file, if it is a path.
     """
-    ranges = given.with_all_anchors()
-    changes = () if given.ranger is None else drop_moved(given.ranger, facts, run_survey)
-    if changes:
-        ranges = given.with_all_anchors()
+    changes = drop_moved(given.ranger, facts) if isinstance(given.ranger, PairRanger) else ()
+    ranges = given.ranges
     counted = count(ranges, facts)
-    on_count(counted)
     result = run_survey(ranges.without_delays({anchor: -half_m for anchor, half_m in before_m.items()}), facts)
     result = replace(result, anchors=tuple(_less(one, before_m.get(one.id, 0.0)) for one in result.anchors))
     return SurveyResult(
-        survey=with_changes(result, changes, ranges.duration_s),
+        survey=with_changes(result, changes, ranges.duration_s) if changes else result,
         count=counted,
         warnings=() if counted.warning is None else (counted.warning,),
-        drops=given.drops,
+        drops=tuple(f"left out: {number} × {reason}" for reason, number in given.drops.items()),
         site=given.site,
         file=Path(file) if isinstance(file, str | Path) else None,
         ranges=ranges,
@@ -290,7 +254,7 @@ def run_survey_site(asked: SurveyOptions) -> SurveyResult:
     """Find the anchors' positions and the errors of their antenna delays, as ``skyless survey`` does."""
     if asked.recording is None:
         raise SkylessError("--recording is missing; it should be a recording, or a table of ranges")
-    return surveyed(asked, gathered(asked.recording, asked.site, None, asked.progress), lambda _: None)
+    return surveyed(asked, gathered(asked.recording, asked.site, None, asked.progress))
 
 
 survey_site = python_function(SurveyOptions, run_survey_site)
@@ -381,7 +345,7 @@ class BiasResult(Result, frozen=True, eq=False):
             yield f"left out: {reason}", str(number)
 
 
-def delays_of_site(asked: CalibrateOptions, on_count: Callable[[Count], None]) -> SurveyResult:
+def delays_of_site(asked: CalibrateOptions) -> SurveyResult:
     """Find the delays of a site's anchors from its ranges and a tag at known positions. Raises SkylessError.
 
     A tag's differences hold the delays of the recording, so the ranges must, too; the result is relative to the site's.
@@ -393,7 +357,7 @@ def delays_of_site(asked: CalibrateOptions, on_count: Callable[[Count], None]) -
     truth = None if asked.truth is None else known_truth(Path(asked.file), asked)
     with McapRecording(asked.file) as recording:
         tags = known_tags(recording, recorded_site(recording, given.site.id), asked, truth)
-    return solved(given, calibration_facts(given.site, tags), asked.site, on_count, given.delays_m)
+    return solved(given, calibration_facts(given.site, tags), asked.site, given.delays_m)
 
 
 def biases_of_other(asked: CalibrateOptions) -> BiasResult:
@@ -408,7 +372,7 @@ def run_calibrate(asked: CalibrateOptions) -> SurveyResult | BiasResult:
     The anchors' positions are kept. In a recording of another system the tag shows each anchor's apparent lateness, up
     to a common constant: a ``BiasResult``.
     """
-    return delays_of_site(asked, lambda _: None) if is_mcap(asked.file) else biases_of_other(asked)
+    return delays_of_site(asked) if is_mcap(asked.file) else biases_of_other(asked)
 
 
 calibrate = python_function(CalibrateOptions, run_calibrate)

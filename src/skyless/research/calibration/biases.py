@@ -30,6 +30,7 @@ from skyless.run.recordings.recording import HostClock, McapRecording, Recorded,
 from skyless.sim.evaluation.figures import EvenSample, TruthTrack
 from skyless.site.anchor_names import anchor_name
 from skyless.site.survey.estimate import CalibrationEstimate, Differences, estimate
+from skyless.site.survey.facts import PairRanges
 from skyless.site.survey.legs import AnchorLeg, LegCollector, RelayedDifferences, RelayMatcher
 from skyless.site.survey.pair_ranger import PairRanger
 from skyless.site.survey.walk import EPOCH_S, EpochCollector, TagEpochs
@@ -324,16 +325,26 @@ _MAX_SEEN: Final = 1 << 16
 """Added legs that are remembered, as several listeners relay the same ones."""
 
 
-class RecordedRanges(Struct, frozen=True):
-    """Ranges from a recording, and its unusable parts."""
+class Gathered(Struct, frozen=True):
+    """Input of a survey."""
 
-    ranger: PairRanger
-    """Gives the ranges, and can drop those from before an anchor was moved."""
-    format: str
-    site: Site | None
-    """The recorded site. None for recordings of other systems."""
-    drops: dict[str, int]
-    """Unusable data, by reason."""
+    ranger: PairRanger | PairRanges
+    """Gives the ranges as measured; a ranger can also drop those from before an anchor was moved."""
+    site: Site | None = None
+    """The site of --site, else of the recording."""
+    drops: dict[str, int] = {}
+    """Unusable parts of a recording, by reason."""
+    is_foreign: bool = False
+    """Whether the recording is of another system."""
+    delays_m: Mapping[int, float] = {}
+    """By how much half an anchor's delays are larger at the site than they were while ranges were measured."""
+
+    @property
+    def ranges(self) -> PairRanges:
+        """The ranges with the antenna delays of the site, and its anchors without ranges, too."""
+        found = self.ranger if isinstance(self.ranger, PairRanges) else self.ranger.ranges()
+        of_site = () if self.site is None else [anchor.id for anchor in self.site.all_anchors]
+        return replace(found.without_delays(self.delays_m), anchors=tuple(sorted({*found.anchors, *of_site})))
 
 
 def ranges_of(
@@ -343,7 +354,7 @@ def ranges_of(
     identifier: int | None = None,
     on_progress: Callable[[float], None] | None = None,
     new_ranger: Callable[[int], PairRanger] = PairRanger,
-) -> RecordedRanges:
+) -> Gathered:
     """Ranges from a recording of ``skyless record``, or of another system; ``format_name`` chooses the format.
 
     ``identifier``: of the site, if it should be checked. ``on_progress`` is called now and then with the share of the
@@ -362,7 +373,7 @@ def ranges_of(
         raise ConfigurationError(path, "format", known.name, f"{right}, or those of --anchors")
     legs = _Legs(new_ranger(known.tx_bits), on_progress)
     drops = _add_receptions(path, legs) if known.name == "avalue" else _add_packets(path, known.name, legs)
-    return RecordedRanges(legs.ranger, known.name, None, dict(drops + legs.finish()))
+    return Gathered(legs.ranger, None, dict(drops + legs.finish()), is_foreign=True)
 
 
 class _Legs:
@@ -399,7 +410,7 @@ def _drops(counters: Counter[str]) -> Counter[str]:
     return Counter({name: count for name, count in counters.items() if name != "legs" and count})
 
 
-def _of_site(path: str | PathLike[str], identifier: int | None, legs: _Legs) -> RecordedRanges:
+def _of_site(path: str | PathLike[str], identifier: int | None, legs: _Legs) -> Gathered:
     """Ranges from tags' receptions, and from anchors' own stamps if recorded."""
     drops: Counter[str] = Counter()
     collectors: dict[str, LegCollector] = {}
@@ -431,7 +442,7 @@ def _of_site(path: str | PathLike[str], identifier: int | None, legs: _Legs) -> 
         damage["unfinished-record"] += 1
     for collector in collectors.values():
         drops += _drops(collector.counters)
-    return RecordedRanges(legs.ranger, SITE_FORMAT, site, dict(damage + drops + legs.finish()))
+    return Gathered(legs.ranger, site, dict(damage + drops + legs.finish()))
 
 
 def _of_anchor(message: StampsMessage, ranger: PairRanger, runs: dict[int, str]) -> list[AnchorLeg]:

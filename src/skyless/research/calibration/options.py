@@ -311,7 +311,6 @@ class CalibrateOptions(RecordingOptions, frozen=True, kw_only=True):
             raise SkylessError("--at says where the antenna was; it should be given without --truth and --lever-arm")
 
 
-_SKETCH_STD_M: Final = 0.3
 _FOREIGN_DELAY_STD_M: Final = 0.03
 _FOREIGN_COMMON_DELAY_STD_M: Final = 1.0
 """For recordings of other systems: uncalibrated boards of one kind are nearly alike, but their common delay is
@@ -351,7 +350,7 @@ def facts_of(asked: SurveyOptions, anchors: Iterable[int], site: Site | None, *,
         tapes=tuple(asked.distances),
         points=points,
         sketch_m=_sketch_m(site),
-        sketch_std_m=_stated_std_m(site) if site is not None and keep else _SKETCH_STD_M,
+        sketch_std_m=_stated_std_m(site) if site is not None and keep else usual.sketch_std_m,
         keep_positions=keep,
         delay_std_m=usual.delay_std_m if asked.delay_std_m is None else asked.delay_std_m,
         pair_std_m=usual.pair_std_m if asked.pair_std_m is None else asked.pair_std_m,

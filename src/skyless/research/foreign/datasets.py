@@ -32,7 +32,7 @@ from skyless.core.arrays import Array
 from skyless.core.ticks import TICK_BITS, TICK_M, TICK_RATE_HZ, TICK_S, difference, wrap
 from skyless.files import Drops, has_columns, open_source, rows
 from skyless.research.foreign.crazyflie import heights_of, in_order
-from skyless.site.survey.legs import TwoWayRanging
+from skyless.site.survey.legs import AnchorFlights
 from skyless.site.tables import Truth
 
 CHANNELS: Final = (1, 3)
@@ -494,11 +494,11 @@ def anchor_distances_m(path: str | PathLike[str], drops: Drops) -> dict[tuple[in
 
     Raises ConfigurationError: the file cannot be opened.
     """
-    ranging = TwoWayRanging(TICK_BITS, window=_RANGED)
+    flights = AnchorFlights(_RANGED)
     with open_source(path) as stream:
         for heard in cross_receptions(stream, drops):
-            ranging.add(heard.sender, heard.receiver, heard.tx_ticks, heard.rx_ticks)
-    return {pair: flight * TICK_M for pair, flight in ranging.flights_ticks().items()}
+            flights.update(heard.sender, heard.receiver, heard.tx_ticks, heard.rx_ticks)
+    return {pair: flight * TICK_M for pair, flight in flights.ranged_ticks().items()}
 
 
 def _transmissions(receptions: Iterator[CrossReception], drops: Drops) -> Iterator[_Transmission]:

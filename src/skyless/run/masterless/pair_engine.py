@@ -20,7 +20,8 @@ from msgspec import Struct
 from skyless.core.air.masterless_packets import Packet, PairTdoa, Point, Relay
 from skyless.core.clock_filter import MAX_RELATIVE_RATE, TwoState, predict, update
 from skyless.core.ticks import SPEED_OF_LIGHT_MPS, TICK_M, TICK_RATE_HZ, TICK_S, Unwrapper, difference, nearest
-from skyless.site.survey.anchor_errors import AnchorFlights, distance_ticks
+from skyless.site.survey.anchor_errors import distance_ticks
+from skyless.site.survey.legs import AnchorFlights
 
 PAIR_RELAY_MAX_AGE_S: Final = 0.25
 """Greatest age of a relayed packet. Older ones cost accuracy, and a 7-bit sequence number recurs."""

@@ -12,7 +12,7 @@ from msgspec import UNSET, Struct, UnsetType
 from msgspec.structs import replace
 
 from skyless.core.site import AlarmRule, FloorPlanSite, FloorSite, Outline, RuleKind, Severity, Site
-from skyless.site.survey.facts import Facts, Survey
+from skyless.site.survey.facts import Facts, PairRange, Survey
 
 if TYPE_CHECKING:
     from skyless.core.fix import Fix
@@ -475,16 +475,6 @@ class SurveySaveMessage(Struct, frozen=True):
     serial: int
 
 
-class SurveyProgress(Struct, frozen=True):
-    """Ranging progress of one pair of anchors."""
-
-    a: int
-    b: int
-    exchanges: int
-    range_m: float
-    std_m: float
-
-
 class SurveyMessage(Struct, frozen=True):
     """State of the survey program."""
 
@@ -496,7 +486,7 @@ class SurveyMessage(Struct, frozen=True):
     missing: tuple[int, ...]
     """Anchors of the site file that are not received."""
     duration_s: float
-    pairs: tuple[SurveyProgress, ...]
+    pairs: tuple[PairRange, ...]
     facts: Facts
     survey: Survey | None
     """None while too few pairs are known."""

@@ -26,7 +26,6 @@ from skyless.run.mqtt.messages import (
     StampsMessage,
     SurveyFactsMessage,
     SurveyMessage,
-    SurveyProgress,
     SurveySaveMessage,
     WatchFinding,
     WatchMessage,
@@ -37,7 +36,8 @@ from skyless.site.file.load import load_site
 from skyless.site.survey.explain import Finding, PhaseWatch
 from skyless.site.survey.facts import Facts, PairBlock, PairRanges, Survey
 from skyless.site.survey.legs import AnchorLeg
-from skyless.site.survey.pair_ranger import PairRanger, StepTable
+from skyless.site.survey.pair_ranger import PairRanger
+from skyless.site.survey.solve import run_survey
 from skyless.site.survey.surveyed_site import (
     FloorImage,
     Saved,
@@ -108,45 +108,22 @@ class LiveSurvey:
         self.missed += message.missed
         if self._runs.setdefault(message.anchor, message.run) != message.run:
             self._runs[message.anchor] = message.run
-            self._ranger.forget(message.anchor)
+            self.ranger.forget(message.anchor)
         t_s = self._sent_s(message.anchor, message.unix_s, now_s)
         for stamp in message.stamps:
             if stamp.anchor in self._known:
                 ticks, phase_cycles = (stamp.tx_ticks, stamp.rx_ticks), stamp.carrier_phase_cycles
                 self._add(AnchorLeg(stamp.anchor, message.anchor, *ticks, t_s, phase_cycles), now_s)
 
-    def set_facts(self, facts: Facts) -> None:
-        """Replace the known facts. Those about anchors not in the site are dropped."""
-        known = self._known
-        gauge = facts.gauge
-        named = set() if gauge is None else {gauge.origin, gauge.x_axis, gauge.left} - {None}
-        self.facts = replace(
-            facts,
-            heights_m={anchor: one for anchor, one in facts.heights_m.items() if anchor in known},
-            tapes=tuple(one for one in facts.tapes if {one.a, one.b} <= known and one.a != one.b),
-            points={anchor: one for anchor, one in facts.points.items() if anchor in known},
-            sketch_m={anchor: one for anchor, one in facts.sketch_m.items() if anchor in known},
-            gauge=gauge if named <= known else None,
-        )
-
     # Results
 
     def ranges(self) -> PairRanges:
         """Return all ranges so far, with all anchors of the site."""
-        return replace(self._ranger.ranges(), anchors=tuple(sorted(self._known)))
-
-    def finish(self) -> PairRanger:
-        """Finish the ranges, including those since the last full second, and return their ranger."""
-        self._ranger.finish()
-        return self._ranger
-
-    def steps(self) -> StepTable:
-        """Return the ranges in order of time, for ``change_of``."""
-        return self._ranger.steps.table()
+        return replace(self.ranger.ranges(), anchors=tuple(sorted(self._known)))
 
     def use_since(self, change: Change) -> None:
         """Drop the ranges before a change, and the results computed from them."""
-        self._ranger.drop_before(change.since_s)
+        self.ranger.drop_before(change.since_s)
         self._changes += (change,)
         self._shown = None
         self._results.clear()
@@ -186,7 +163,7 @@ class LiveSurvey:
         present = {anchor for anchor, heard_s in self._heard_s.items() if now_s - heard_s <= PRESENT_S}
         # Ranges of 1225 pairs take half a second, so they are renewed only every six seconds.
         if self._shown is None or not 0.0 <= now_s - self._shown[1] < len(self._shown[0].pairs) / _SHOWN_PAIRS_PER_S:
-            self._shown = self._ranger.ranges(), now_s
+            self._shown = self.ranger.ranges(), now_s
         ranges = self._shown[0]
         error = self.error
         if error is None and state == "no data":
@@ -198,7 +175,7 @@ class LiveSurvey:
             anchors=tuple(sorted(present)),
             missing=tuple(sorted(self._known - present)),
             duration_s=ranges.duration_s,
-            pairs=tuple(SurveyProgress(one.a, one.b, one.exchanges, one.range_m, one.std_m) for one in ranges.pairs),
+            pairs=ranges.pairs,
             facts=self.facts,
             survey=None if newest is None else newest[0],
             error=error,
@@ -233,7 +210,7 @@ class LiveSurvey:
         """Forget all ranges and results, because an anchor or antenna delays have changed."""
         self.begun += 1
         self._known = {anchor.id for anchor in self.site.all_anchors}
-        self._ranger = PairRanger(on_block=self._on_block)
+        self.ranger = PairRanger(on_block=self._on_block)
         self._shown = None
         self._changes = ()
         self._results.clear()
@@ -242,7 +219,7 @@ class LiveSurvey:
 
     def _add(self, leg: AnchorLeg, now_s: float) -> None:
         self._newest_s = self._heard_s[leg.sender] = self._heard_s[leg.receiver] = now_s
-        self._ranger.add(leg.sender, leg.receiver, leg.tx_ticks, leg.rx_ticks, leg.t_s)
+        self.ranger.add(leg.sender, leg.receiver, leg.tx_ticks, leg.rx_ticks, leg.t_s)
         if self._watch is not None and leg.carrier_phase_cycles is not None:
             self._watch.waiting_legs.append(leg)
 
@@ -331,8 +308,6 @@ _ENDED_S: Final = 3.0 * QUIET_S  # an earlier program without a message for this
 
 _SAME_SIZE: Final = 0.25  # a finding whose size has changed by a smaller share than this is not logged again
 
-Solve = Callable[[PairRanges, Facts], Survey]
-
 
 class SurveySettings(Struct, frozen=True):
     """Settings of a survey program."""
@@ -350,14 +325,12 @@ class SurveySettings(Struct, frozen=True):
 class SurveyNode:
     """The survey program of one site, with stamps from MQTT."""
 
-    def __init__(
-        self, settings: SurveySettings, facts_of: FactsOf, solve: Solve, address: MqttAddress, log: Log
-    ) -> None:
-        """``facts_of``: facts about a site known without a user's help. ``solve``: ``survey.solve.run_survey``."""
+    def __init__(self, settings: SurveySettings, facts_of: FactsOf, address: MqttAddress, log: Log) -> None:
+        """``facts_of``: facts about a site known without a user's help."""
         self.live: LiveSurvey | None = None  # None before the site is known
         self.problems = 0  # messages that could not be read
         self.saved: Saved | None = None
-        self._settings, self._facts_of, self._solve, self._log = settings, facts_of, solve, log
+        self._settings, self._facts_of, self._log = settings, facts_of, log
         self._given: SurveyFactsMessage | None = None
         self._running: Site | None = None  # the site of the anchors, as they publish it
         self._placement: PlacementMessage | None = None  # the newest on MQTT
@@ -452,7 +425,7 @@ class SurveyNode:
             return
         self._given = message
         if self.live is not None:
-            self.live.set_facts(message.facts)
+            self.live.facts = message.facts
             self._facts_changed = True
             self._next_solve_s = self._next_publish_s = 0.0
 
@@ -487,22 +460,16 @@ class SurveyNode:
             self._log(f"survey: {error}")
             facts = Facts()
         self.live = LiveSurvey(site, facts, record)
-        self.live.set_facts(facts)
         self._next_solve_s = 0.0
 
     # Results
 
-    def final_ranges(self) -> PairRanges:
-        """Return the final ranges, computed with the antenna delays of the site to be surveyed.
-
-        The anchors may run with other delays. Call this only once the site is known.
-        """
-        assert self.live is not None
-        self.live.finish()
-        ranges = self.live.ranges()
-        if self._running is None:
-            return ranges
-        return ranges.without_delays(delay_differences_m(self._running, self.live.site))
+    @property
+    def delays_m(self) -> dict[int, float]:
+        """By how much half an anchor's delays are larger at the site to be surveyed than at the anchors as they run."""
+        if self.live is None or self._running is None:
+            return {}
+        return delay_differences_m(self._running, self.live.site)
 
     def update(self) -> None:
         """Start computing another result if one is due, and publish what is due."""
@@ -528,12 +495,12 @@ class SurveyNode:
             return
         begin_s = time.monotonic()
         try:
-            change = await asyncio.to_thread(change_of, live.steps(), facts, self._solve)
+            change = await asyncio.to_thread(change_of, live.ranger.steps.table(), facts)
             if change is not None and live.begun == begun:
                 self._log(f"survey: {change.sentence}; only ranges since then are used")
                 live.use_since(change)
                 ranges = live.ranges()
-            survey = await asyncio.to_thread(self._solve, ranges, facts)
+            survey = await asyncio.to_thread(run_survey, ranges, facts)
         except SkylessError as error:
             live.error = str(error)
             return

@@ -9,8 +9,8 @@ import numpy as np
 from msgspec import Struct
 
 from skyless.core.air.masterless_packets import PairTdoa, Point
-from skyless.core.ticks import TICK_BITS, TICK_M
-from skyless.site.survey.legs import RunningMedian, TwoWayRanging
+from skyless.core.ticks import TICK_M
+from skyless.site.survey.legs import AnchorFlights, RunningMedian
 from skyless.site.survey.problem import incidence
 
 MIN_NOISE_M: Final = 0.05
@@ -71,50 +71,16 @@ class DifferenceCalibration(Struct, frozen=True):
         )
 
 
-# Flights between anchors
+# Antenna delays
 
-
-RANGED_WINDOW: Final = 101
-"""Exchanges in the running median of a pair's ranged flight."""
 
 Pair = tuple[int, int]
-
-
-class AnchorFlights:
-    """Median flight of each pair: as stated by its anchors, or ranged from exchanges if neither states any."""
-
-    def __init__(self) -> None:
-        self._stated: dict[Pair, RunningMedian] = {}
-        self._ranging = TwoWayRanging(TICK_BITS, window=RANGED_WINDOW)
-
-    def update(self, a: int, b: int, tx_a: int, rx_b: int, stated_ticks: float | None) -> float | None:
-        """Add b's reception of a's packet, with the flight that b states, if any. Stamps are unwrapped.
-
-        Returns the pair's flight in ticks, None while unknown.
-        """
-        pair = (a, b) if a < b else (b, a)
-        median = self._stated.get(pair)
-        if stated_ticks is not None:
-            if median is None:
-                median = self._stated[pair] = RunningMedian()
-            return median.add(stated_ticks)
-        if median is not None:
-            return median.value
-        self._ranging.add(a, b, tx_a, rx_b)
-        return self._ranging.flight_ticks(a, b)
-
-    def forget(self, anchor: int) -> None:
-        """Drop the open exchanges of an anchor whose clock restarted, but keep its flights."""
-        self._ranging.forget(anchor)
 
 
 def distance_ticks(anchors_m: Mapping[int, Point], a: int, b: int) -> float | None:
     """Time of flight between two anchors' positions, without antenna delays; None if a position is unknown."""
     one, other = anchors_m.get(a), anchors_m.get(b)
     return None if one is None or other is None else dist(one, other) / TICK_M
-
-
-# Antenna delays
 
 
 EXCESS_STD_M: Final = 0.1

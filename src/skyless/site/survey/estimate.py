@@ -14,7 +14,7 @@ from scipy.sparse.csgraph import connected_components
 
 from skyless.core.arrays import Array, Integers, Mask, Vector
 from skyless.site.survey.anchor_errors import AnchorCalibration, DifferenceCalibration
-from skyless.site.survey.legs import STD_OVER_MAD
+from skyless.site.survey.legs import STD_OVER_MAD, group_medians
 
 # Robust regression
 
@@ -71,7 +71,10 @@ def fit(data: Differences, anchors: Integers, *, slope: bool) -> Fit:
     """Fit one constant per anchor, and a slope if wanted. The differences must link all anchors."""
     a, b = np.searchsorted(anchors, data.anchor_a), np.searchsorted(anchors, data.anchor_b)
     design = _design(a, b, data.log_ratio if slope else np.zeros(len(a)), len(anchors))
-    y = _pair_medians(a, b, data.excess_m, len(anchors))
+    pair, pairs = a * len(anchors) + b, len(anchors) ** 2
+    # Each difference is first its pair's median: a start that outliers do not affect.
+    medians = [group_medians(pair, data.excess_m, pairs, upper=upper) for upper in (False, True)]
+    y = np.mean(medians, axis=0)[pair]
     weights = np.ones(len(a))
     for step in range(50):
         before = weights
@@ -98,16 +101,6 @@ def moves(data: Differences, found: Fit) -> bool:
     design = _design(found.a, found.b, still, len(found.anchors))
     alike = np.linalg.solve(_normal(design, still + 1.0), design.T @ data.log_ratio)
     return float(np.sqrt(np.mean((data.log_ratio - design @ alike) ** 2))) > _MIN_MOTION
-
-
-def _pair_medians(a: Integers, b: Integers, excess_m: Vector, count: int) -> Vector:
-    """Each difference replaced by its pair's median: a start for the fit that outliers do not affect."""
-    start = np.empty_like(excess_m)
-    pair = a * count + b
-    for one in np.unique(pair):
-        of_pair = pair == one
-        start[of_pair] = np.median(excess_m[of_pair])
-    return start
 
 
 def _design(a: Integers, b: Integers, x: Vector, count: int) -> Any:  # noqa: ANN401 - a sparse array

@@ -22,7 +22,7 @@ from scipy.special import chdtri
 from skyless.core.arrays import Array, Integers, Mask
 from skyless.core.ticks import CARRIER_CYCLES, TICK_M, TICK_RATE_HZ, difference
 from skyless.site.survey.legs import MAX_BRACKET_RATE, STD_OVER_MAD, AnchorLeg
-from skyless.site.survey.problem import incidence, unit_vectors
+from skyless.site.survey.problem import distance_derivatives, incidence
 
 # Findings
 
@@ -134,7 +134,7 @@ def evidence(pairs: Pairs, weight: Array, weighted_m: Array) -> tuple[Array, Int
     (..., m).
     """
     n, dim, m = pairs.anchors, pairs.dimensions, len(pairs.first)
-    moved = _moved_columns(pairs, pairs.position_m).reshape(m, n * dim)
+    moved = distance_derivatives(pairs.position_m, pairs.first, pairs.second)[:, :, :dim].reshape(m, n * dim)
     delayed = incidence(n, pairs.first, pairs.second)
     products = (weight @ moved).reshape(m, n, dim)
     information, directions = np.linalg.eigh(np.einsum("pid,pie->ide", moved.reshape(m, n, dim), products))
@@ -208,16 +208,6 @@ def _inverse(information: Array) -> Array:
     return np.asarray((vectors * np.where(is_seen, 1.0 / np.where(is_seen, values, 1.0), 0.0)) @ vectors.T)
 
 
-def _moved_columns(pairs: Pairs, position_m: Array) -> Array:
-    """Derivatives of each pair's distance with respect to the anchors' positions, shape (m, n, dim)."""
-    unit = unit_vectors(position_m, pairs.first, pairs.second)[:, : pairs.dimensions]
-    columns = np.zeros((len(pairs.first), pairs.anchors, pairs.dimensions))
-    rows = np.arange(len(pairs.first))
-    columns[rows, pairs.first] = unit
-    columns[rows, pairs.second] = -unit
-    return columns
-
-
 def _model(pairs: Pairs, causes: Sequence[int], ends: Integers, parameter: Array) -> tuple[Array, Array]:
     """Derivatives, shape (m, k), and changes predicted from these parameters, shape (m,)."""
     n, m, dim = pairs.anchors, len(pairs.first), pairs.dimensions
@@ -228,7 +218,8 @@ def _model(pairs: Pairs, causes: Sequence[int], ends: Integers, parameter: Array
     apart_m = np.linalg.norm(position_m[pairs.first] - position_m[pairs.second], axis=1)
     predicted = apart_m - np.linalg.norm(pairs.position_m[pairs.first] - pairs.position_m[pairs.second], axis=1)
     columns = np.zeros((m, len(parameter)))
-    moved, delayed = _moved_columns(pairs, position_m), incidence(n, pairs.first, pairs.second)
+    moved = distance_derivatives(position_m, pairs.first, pairs.second)[:, :, :dim]
+    delayed = incidence(n, pairs.first, pairs.second)
     for cause, end in zip(causes, ends.tolist(), strict=True):
         if cause < n:
             columns[:, end - dim : end] = moved[:, cause]

@@ -9,6 +9,7 @@ A survey knows positions only up to a rigid motion, so a covariance needs a set 
 are aligned. An anchor whose standard deviation remains above ``max_std_m`` leaves the core: it is not determined.
 """
 
+from collections.abc import Sequence
 from itertools import combinations
 from typing import Final
 
@@ -18,6 +19,7 @@ from msgspec.structs import astuple, replace
 from scipy.sparse.csgraph import connected_components
 
 from skyless.core.arrays import Array, Integers, Mask
+from skyless.site.survey.facts import TapeAdvice
 from skyless.site.survey.problem import (
     Problem,
     Solution,
@@ -910,24 +912,19 @@ The first of several equally good tapes is chosen, so that noise does not change
 """
 
 
-class TapeChoice(Struct, frozen=True, eq=False):
-    """A distance to measure, by indices, and its benefit."""
-
-    first: int
-    second: int
-    std_before_m: float
-    std_after_m: float
-    """RMS over the anchors of the core."""
-    worst_after_m: float
-    """Standard deviation of the least determined anchor of the core."""
-
-
 def best_tapes(
-    problem: Problem, position_m: Array, covariance_m2: Array, core: Mask, most: int = 3, until_m: float = 0.0
-) -> list[TapeChoice]:
-    """Choose the best distances one by one, until the worst standard deviation is ``until_m`` or less.
+    problem: Problem,
+    anchors: Sequence[int],
+    position_m: Array,
+    covariance_m2: Array,
+    core: Mask,
+    most: int = 3,
+    until_m: float = 0.0,
+) -> tuple[list[TapeAdvice], float]:
+    """Choose the best distances one by one, until the worst standard deviation in the core is ``until_m`` or less.
 
-    ``covariance_m2``: after alignment over the core, shape (4 n, 4 n).
+    Returns them with that standard deviation. ``anchors``: identifiers. ``covariance_m2``: after alignment over the
+    core, shape (4 n, 4 n).
     """
     n = len(position_m)
     first, second = np.triu_indices(n, 1)
@@ -935,9 +932,9 @@ def best_tapes(
     first, second = first[usable], second[usable]
     unit = unit_vectors(position_m, first, second)
     inside = np.repeat(core, 3)
-    covariance = covariance_m2.copy()
-    chosen: list[TapeChoice] = []
-    while first.size and len(chosen) < most:
+    covariance, worst_m = covariance_m2.copy(), np.inf
+    chosen: list[TapeAdvice] = []
+    while first.size and len(chosen) < most and worst_m > until_m:
         columns = np.zeros((len(covariance), len(first)))
         for axis in range(3):
             a, b = covariance[:, 3 * first + axis], covariance[:, 3 * second + axis]
@@ -958,18 +955,11 @@ def best_tapes(
         after = _rms(stds)
         if after > before * (1.0 - _MIN_TAPE_GAIN):
             break
-        chosen.append(TapeChoice(int(first[best]), int(second[best]), before, after, float(stds.max())))
+        a, b = sorted((anchors[first[best]], anchors[second[best]]))
+        chosen.append(TapeAdvice(a, b, before, after))
+        worst_m = float(stds.max())
         first, second, unit = np.delete(first, best), np.delete(second, best), np.delete(unit, best, axis=0)
-        if chosen[-1].worst_after_m <= until_m:
-            break
-    return chosen
-
-
-def mending_tapes(problem: Problem, position_m: Array, covariance_m2: Array, core: Mask) -> list[TapeChoice]:
-    """The distances that would determine every anchor of the core; empty if six are not enough."""
-    most_m = max_std_m(problem)
-    chosen = best_tapes(problem, position_m, covariance_m2, core, most=6, until_m=most_m)
-    return chosen if chosen and chosen[-1].worst_after_m <= most_m else []
+    return chosen, worst_m
 
 
 def _rms(stds_m: Array) -> float:

@@ -16,7 +16,7 @@ from msgspec import Struct
 from skyless.core.air.frame import Heard, Malformed, Reception
 from skyless.core.air.masterless_packets import Relay
 from skyless.core.any_receiver import SiteBeacon, decode_any
-from skyless.core.arrays import Array, Mask
+from skyless.core.arrays import Array, Integers, Mask
 from skyless.core.ticks import MAX_DRIFT, TICK_BITS, TICK_M, TICK_RATE_HZ, Unwrapper, difference, to_seconds
 from skyless.site.survey.facts import PairRange, PairRanges
 
@@ -35,9 +35,6 @@ class RunningMedian:
         self._window = window
         self._arrived: deque[float] = deque()
         self._sorted: list[float] = []
-
-    def __len__(self) -> int:
-        return len(self._sorted)
 
     def add(self, value: float) -> float:
         """Add one finite value and return the median (the upper one for an even number of values)."""
@@ -89,44 +86,45 @@ def bracketed_flight_ticks(before: Leg, back: Leg, after: Leg, bits: int) -> flo
     return flight if abs(flight) < MAX_FLIGHT_TICKS else None
 
 
-class TwoWayRanging:
-    """Running median of the time of flight of every pair of nodes, updated with each reception."""
+class AnchorFlights:
+    """Median flight of each pair of nodes: as they state it, or ranged from their receptions if neither states any."""
 
-    def __init__(self, bits: int, window: int = 1001) -> None:
-        self._bits = bits
+    def __init__(self, window: int = 101) -> None:
+        """``window``: exchanges in the running median of a ranged flight."""
         self._window = window
         self._last: dict[tuple[int, int], Leg] = {}
-        self._flights: dict[tuple[int, int], RunningMedian] = {}
+        self._stated: dict[tuple[int, int], RunningMedian] = {}
+        self._ranged: dict[tuple[int, int], RunningMedian] = {}
 
-    def add(self, sender: int, receiver: int, tx_ticks: int, rx_ticks: int) -> float | None:
-        """Add one reception. Returns the time of flight in ticks if this completes a bracket."""
-        leg = Leg(tx_ticks, rx_ticks)
-        before = self._last.get((sender, receiver))
-        self._last[sender, receiver] = leg
-        back = self._last.get((receiver, sender))
-        if before is None or back is None:
-            return None
-        flight = bracketed_flight_ticks(before, back, leg, self._bits)
-        if flight is not None:
-            self._flights.setdefault(_pair(sender, receiver), RunningMedian(self._window)).add(flight)
-        return flight
+    def update(self, a: int, b: int, tx_a: int, rx_b: int, stated_ticks: float | None = None) -> float | None:
+        """Add b's reception of a's packet, with the flight that b states, if any. Stamps may be unwrapped.
+
+        Returns the pair's flight in ticks, None while unknown.
+        """
+        pair = (a, b) if a < b else (b, a)
+        median = self._stated.get(pair)
+        if stated_ticks is not None:
+            if median is None:
+                median = self._stated[pair] = RunningMedian()
+            return median.add(stated_ticks)
+        if median is not None:
+            return median.value
+        leg = Leg(tx_a, rx_b)
+        before, back = self._last.get((a, b)), self._last.get((b, a))
+        self._last[a, b] = leg
+        if before is not None and back is not None:
+            flight = bracketed_flight_ticks(before, back, leg, TICK_BITS)
+            if flight is not None:
+                return self._ranged.setdefault(pair, RunningMedian(self._window)).add(flight)
+        return None if (ranged := self._ranged.get(pair)) is None else ranged.value
 
     def forget(self, node: int) -> None:
-        """Drop the open brackets of a node whose clock restarted, but keep its times of flight."""
+        """Drop the open brackets of a node whose clock restarted, but keep its flights."""
         self._last = {pair: leg for pair, leg in self._last.items() if node not in pair}
 
-    def flight_ticks(self, x: int, y: int) -> float | None:
-        """Median time of flight of a pair in ticks, None before its first bracket."""
-        median = self._flights.get(_pair(x, y))
-        return None if median is None else median.value
-
-    def flights_ticks(self) -> dict[tuple[int, int], float]:
-        """Median time of flight of every pair, the smaller identifier first."""
-        return {pair: value for pair, median in self._flights.items() if (value := median.value) is not None}
-
-
-def _pair(x: int, y: int) -> tuple[int, int]:
-    return (x, y) if x < y else (y, x)
+    def ranged_ticks(self) -> dict[tuple[int, int], float]:
+        """Ranged flight of every pair, the smaller identifier first."""
+        return {pair: value for pair, median in self._ranged.items() if (value := median.value) is not None}
 
 
 _LONGEST_AGE_TICKS: Final = round(2.0 * TICK_RATE_HZ)
@@ -265,6 +263,16 @@ MEDIAN_VARIANCE: Final = math.pi / 2.0
 
 MIN_CLUSTER_SHARE: Final = 0.1
 """An early cluster with a smaller share of all exchanges is taken as an error."""
+
+
+def group_medians(group_of: Integers, values: Array, groups: int, *, upper: bool = False) -> Array:
+    """Lower or upper median of each group, shape (groups,); 0 for a group without a value."""
+    order, size = np.lexsort((values, group_of)), np.bincount(group_of, minlength=groups)
+    middle = np.cumsum(size) - size + (size if upper else size - 1) // 2
+    medians = np.zeros(groups)
+    medians[size > 0] = values[order][middle[size > 0]]
+    return medians
+
 
 _SIGMAS: Final = 4.0
 _DENSE_SHARE: Final = 0.3

@@ -12,12 +12,18 @@ from typing import Final
 
 import numpy as np
 from msgspec import Struct
-from msgspec.structs import astuple, replace
 
-from skyless.core.arrays import Array, Integers, Mask
+from skyless.core.arrays import Array, Integers, Mask, Records
 from skyless.core.ticks import TICK_BITS, TICK_M, TICK_RATE_HZ, Unwrapper
 from skyless.site.survey.facts import PairBlock, PairRange, PairRanges
-from skyless.site.survey.legs import MAX_BRACKET_RATE, MAX_FLIGHT_TICKS, MEDIAN_VARIANCE, STD_OVER_MAD, earliest_cluster
+from skyless.site.survey.legs import (
+    MAX_BRACKET_RATE,
+    MAX_FLIGHT_TICKS,
+    MEDIAN_VARIANCE,
+    STD_OVER_MAD,
+    earliest_cluster,
+    group_medians,
+)
 
 _KEPT_S: Final = 5.0  # how long legs wait for the other direction, which another anchor may publish later
 _LONGEST_BRACKET_S: Final = 0.5  # between the two frames of a bracket; at most half a wrap
@@ -37,71 +43,48 @@ _MIN_OWN_SHARE: Final = 0.2  # share of a mean's variance that is the pair's own
 # Brackets: like ``bracketed_flight_ticks`` in ``site/survey/legs.py``, for many pairs at once
 
 
-class Legs(Struct, frozen=True, eq=False):
-    """Legs of many pairs, each array of shape (n,)."""
+LEGS: Final = np.dtype(
+    [("pair", "i8"), ("a_ticks", "i8"), ("b_ticks", "i8"), ("is_back", "?"), ("is_used", "?"), ("t_s", "f8")]
+)
+"""Number of the pair, unwrapped stamps on the counters of its two anchors, whether the leg went from b to a, whether
+its time of flight has already been computed, and its time."""
 
-    pair: Integers
-    """Number of the pair."""
-    a_ticks: Integers
-    b_ticks: Integers
-    """Unwrapped stamps on the counters of the pair's two anchors."""
-    is_back: Mask
-    """Whether the leg went from b to a."""
-    is_used: Mask
-    """Whether its time of flight has already been computed."""
-    t_s: Array
-
-    def part(self, index: Integers | Mask) -> "Legs":
-        """Select rows."""
-        return Legs(*(column[index] for column in astuple(self)))
+FLIGHTS: Final = np.dtype([("leg", "i8"), ("ticks", "f8"), ("part", "f8")])
+"""Index of the bracketed leg, time of flight, and position of that leg between the two that bracket it, 0 to 1."""
 
 
-class Flights(Struct, frozen=True, eq=False):
-    """Times of flight, each array of shape (k,)."""
-
-    leg: Integers
-    """Index of the bracketed leg."""
-    ticks: Array
-    part: Array
-    """Position of that leg between the two that bracket it, 0 to 1."""
-
-
-def flights_of(legs: Legs, longest_ticks: int) -> tuple[Flights, Legs, int]:
+def flights_of(legs: Records, longest_ticks: int) -> tuple[Records, Records, int]:
     """Times of flight of all legs that are not yet used and are bracketed within ``longest_ticks``.
 
     Returns the flights (which index ``legs``), the legs needed for later brackets, and the number of brackets that
     cannot belong to one pair of counters.
     """
-    legs_a = _bracketed(legs, legs.a_ticks, legs.b_ticks, legs.is_back, longest_ticks)
-    legs_b = _bracketed(legs, legs.b_ticks, legs.a_ticks, ~legs.is_back, longest_ticks)
-    used = legs.is_used.copy()
-    used[legs_a.seen] = True
-    used[legs_b.seen] = True
-    flights = Flights(*map(np.concatenate, zip(astuple(legs_a.flights), astuple(legs_b.flights), strict=True)))
-    kept = replace(legs, is_used=used).part(legs_a.is_needed | legs_b.is_needed)
-    return flights, kept, legs_a.impossible + legs_b.impossible
+    a_ticks, b_ticks, is_back = legs["a_ticks"], legs["b_ticks"], legs["is_back"]
+    of_a, seen_by_a, is_needed_by_a, impossible_a = _bracketed(legs, a_ticks, b_ticks, is_back, longest_ticks)
+    of_b, seen_by_b, is_needed_by_b, impossible_b = _bracketed(legs, b_ticks, a_ticks, ~is_back, longest_ticks)
+    kept = legs.copy()
+    kept["is_used"][np.concatenate([seen_by_a, seen_by_b])] = True
+    return np.concatenate([of_a, of_b]), kept[is_needed_by_a | is_needed_by_b], impossible_a + impossible_b
 
 
-class _OneWay(Struct, frozen=True, eq=False):
-    flights: Flights
-    seen: Integers
-    """Legs that were bracketed, with or without a time of flight."""
-    is_needed: Mask
-    impossible: int
+def _bracketed(
+    legs: Records, x_ticks: Integers, y_ticks: Integers, is_reply: Mask, longest_ticks: int
+) -> tuple[Records, Integers, Mask, int]:
+    """Flights of replies y → x that lie between two legs x → y on x's counter.
 
-
-def _bracketed(legs: Legs, x_ticks: Integers, y_ticks: Integers, is_reply: Mask, longest_ticks: int) -> _OneWay:
-    """Flights of replies y → x that lie between two legs x → y on x's counter."""
-    order = np.lexsort((x_ticks, legs.pair))
-    rows = np.stack([legs.pair, x_ticks, is_reply])[:, order]
+    Also returns the legs that were bracketed, with or without a time of flight, a mask of those that are still needed,
+    and the number of impossible brackets.
+    """
+    order = np.lexsort((x_ticks, legs["pair"]))
+    rows = np.stack([legs["pair"], x_ticks, is_reply])[:, order]
     order = order[np.append(True, (np.diff(rows) != 0).any(axis=0))[: len(order)]]  # without repeated legs
-    pair, reply = legs.pair[order], is_reply[order]
+    pair, reply = legs["pair"][order], is_reply[order]
     row, n = np.arange(len(order)), len(order)
     before = np.maximum.accumulate(np.where(reply, -1, row)) if n else row
     after = np.minimum.accumulate(np.where(reply, n, row)[::-1])[::-1] if n else row
     has_before = (before >= 0) & (pair[np.maximum(before, 0)] == pair)
     has_after = (after < n) & (pair[np.minimum(after, n - 1)] == pair) if n else row > 0
-    new = np.flatnonzero(reply & has_before & has_after & ~legs.is_used[order])
+    new = np.flatnonzero(reply & has_before & has_after & ~legs["is_used"][order])
     middle, first, last = order[new], order[before[new]], order[after[new]]
     span = (x_ticks[last] - x_ticks[first]).astype(np.float64)
     until = (x_ticks[middle] - x_ticks[first]).astype(np.float64)
@@ -114,7 +97,7 @@ def _bracketed(legs: Legs, x_ticks: Integers, y_ticks: Integers, is_reply: Mask,
     good = in_time & (until > 0.0) & (until < span) & (np.abs(rate) <= MAX_BRACKET_RATE)
     good &= np.abs(ticks) < MAX_FLIGHT_TICKS
     # Later replies come after the pair's last reply, so only the leg that precedes it and newer ones are still needed.
-    needed = np.ones(len(legs.pair), dtype=bool)
+    needed = np.ones(len(legs), dtype=bool)
     replies = np.flatnonzero(reply)
     if len(replies):
         last_of_pair = replies[np.append(pair[replies][1:] != pair[replies][:-1], True)]
@@ -122,7 +105,9 @@ def _bracketed(legs: Legs, x_ticks: Integers, y_ticks: Integers, is_reply: Mask,
         cut[pair[last_of_pair]] = np.where(has_before[last_of_pair], before[last_of_pair], last_of_pair)
         needed[:] = False
         needed[order[row >= cut[pair]]] = True
-    return _OneWay(Flights(middle[good], ticks[good], part[good]), middle, needed, int(np.sum(in_time & ~good)))
+    flights = np.empty(np.count_nonzero(good), FLIGHTS)
+    flights["leg"], flights["ticks"], flights["part"] = middle[good], ticks[good], part[good]
+    return flights, middle, needed, int(np.sum(in_time & ~good))
 
 
 # Steps: ranges in the order of time, to see whether they stayed the same
@@ -232,8 +217,9 @@ class PairRanger:
         self._longest_ticks = min(round(_LONGEST_BRACKET_S * TICK_RATE_HZ), (1 << (bits - 1)) - 1)
         self._clocks: defaultdict[int, Unwrapper] = defaultdict(partial(Unwrapper, bits=bits))
         self._number: dict[tuple[int, int], int] = {}
-        self._open: list[tuple[int, int, int, bool, float]] = []
-        self._kept = _legs_of([])
+        self._open: list[tuple[int, int, int, bool, bool, float]] = []
+        """As in ``LEGS``."""
+        self._kept = np.empty(0, LEGS)
         self._histories: list[_History] = []
         self._shared_m2 = self._products = 0.0
         """Sum of residual products of two pairs that share an anchor's frame, and their number."""
@@ -265,7 +251,7 @@ class PairRanger:
         rx = self._clocks[receiver].unwrap(rx_ticks, t_s)
         self.counters["legs"] += 1
         is_back = sender > receiver
-        self._open.append((number, rx, tx, True, t_s) if is_back else (number, tx, rx, False, t_s))
+        self._open.append((number, *((rx, tx) if is_back else (tx, rx)), is_back, False, t_s))
         if len(self._open) >= _MAX_OPEN_LEGS:
             self._close_block()
 
@@ -274,7 +260,7 @@ class PairRanger:
         self._clocks.pop(anchor, None)
         numbers = [number for pair, number in self._number.items() if anchor in pair]
         self._open = [leg for leg in self._open if leg[0] not in set(numbers)]
-        self._kept = self._kept.part(~np.isin(self._kept.pair, numbers))
+        self._kept = self._kept[~np.isin(self._kept["pair"], numbers)]
 
     def drop_before(self, t_s: float) -> None:
         """Drop the ranges from before a time, when an anchor was elsewhere."""
@@ -326,7 +312,7 @@ class PairRanger:
             if block is not None:
                 self._close_block()
             if block is None or not -_KEPT_S < t_s - self._last_s < _KEPT_S:
-                self._kept, self._first_s = _legs_of([]), t_s
+                self._kept, self._first_s = np.empty(0, LEGS), t_s
                 self._clocks.clear()
             self._block = number
             self._last_s = t_s
@@ -337,24 +323,24 @@ class PairRanger:
     def _close_block(self) -> None:
         if not self._open or self._block is None:
             return
-        legs = Legs(*map(np.concatenate, zip(astuple(self._kept), astuple(_legs_of(self._open)), strict=True)))
+        legs = np.concatenate([self._kept, np.array(self._open, LEGS)])
         self._open = []
         flights, kept, impossible = flights_of(legs, self._longest_ticks)
-        self._kept = kept.part(kept.t_s > self._last_s - _KEPT_S)
+        self._kept = kept[kept["t_s"] > self._last_s - _KEPT_S]
         self._duration_s += self._last_s - self._first_s
         self._first_s = self._last_s
         self.counters["impossible"] += impossible
-        if len(flights.leg):
+        if len(flights):
             self._add_block(legs, flights, (self._block + 0.5) * self._block_s)
 
-    def _add_block(self, legs: Legs, flights: Flights, t_s: float) -> None:
+    def _add_block(self, legs: Records, flights: Records, t_s: float) -> None:
         """Add the mean of each pair's flights without outliers, and learn the stamp noise from their scatter."""
-        pair, range_m = legs.pair[flights.leg], flights.ticks * TICK_M
-        good = _inliers(pair, range_m)
-        leg, pair, range_m, part = flights.leg[good], pair[good], range_m[good], flights.part[good]
+        good = _inliers(legs["pair"][flights["leg"]], flights["ticks"] * TICK_M)
+        leg, range_m, part = flights["leg"][good], flights["ticks"][good] * TICK_M, flights["part"][good]
+        pair = legs["pair"][leg]
         count = len(self._histories)
         n = np.bincount(pair, minlength=count)
-        back = np.bincount(pair, legs.is_back[leg], minlength=count)
+        back = np.bincount(pair, legs["is_back"][leg], minlength=count)
         one_each = 1.0 / np.maximum(back, 1.0) + 1.0 / np.maximum(n - back, 1.0)
         mean_m = np.bincount(pair, range_m, minlength=count) / np.maximum(n, 1)
         residual_m = range_m - mean_m[pair]
@@ -379,12 +365,12 @@ class PairRanger:
             if self._on_block is not None:
                 self._on_block(block)
 
-    def _share(self, legs: Legs, leg: Integers, residual_m: Array, n: Integers) -> None:
+    def _share(self, legs: Records, leg: Integers, residual_m: Array, n: Integers) -> None:
         """Sum the residual products of pairs that were bracketed with the same frame of an anchor."""
         anchors = np.array(list(self._number), dtype=np.int64).reshape(-1, 2)
-        pair, is_back = legs.pair[leg], legs.is_back[leg]
+        pair, is_back = legs["pair"][leg], legs["is_back"][leg]
         sender = np.where(is_back, anchors[pair, 1], anchors[pair, 0])
-        tx_ticks = np.where(is_back, legs.b_ticks[leg], legs.a_ticks[leg])
+        tx_ticks = np.where(is_back, legs["b_ticks"][leg], legs["a_ticks"][leg])
         order = np.lexsort((tx_ticks, sender))
         first = np.ones(len(order), dtype=bool)
         first[1:] = (np.diff(sender[order]) != 0) | (np.diff(tx_ticks[order]) != 0)
@@ -491,27 +477,8 @@ def _wander_m2(range_m: Array, exchanges: Array, noise_m2: float) -> float:
 
 def _inliers(pair: Integers, value: Array) -> Mask:
     """Mask of flights within 5 sigma of their pair's median, by the larger of the pair's and the site's scatter."""
-    order = np.lexsort((value, pair))
-    begin = np.flatnonzero(np.append(True, np.diff(pair[order]) != 0))
-    size = np.diff(np.append(begin, len(order)))
-    median = np.zeros(int(pair.max()) + 1)
-    median[pair[order[begin]]] = value[order[begin + size // 2]]
-    distance = np.abs(value - median[pair])
-    order = np.lexsort((distance, pair))
-    scatter = np.zeros(len(median))
-    scatter[pair[order[begin]]] = distance[order[begin + size // 2]]
-    scatter = STD_OVER_MAD * np.maximum(scatter, np.median(distance))
+    count = int(pair.max()) + 1
+    distance = np.abs(value - group_medians(pair, value, count, upper=True)[pair])
+    own = group_medians(pair, distance, count, upper=True)
+    scatter = STD_OVER_MAD * np.maximum(own, np.median(distance))
     return np.asarray(distance <= _OUTLIER_SIGMAS * scatter[pair] + TICK_M)
-
-
-def _legs_of(rows: list[tuple[int, int, int, bool, float]]) -> Legs:
-    pair, a_ticks, b_ticks, is_back, t_s = zip(*rows, strict=True) if rows else ((),) * 5
-    whole = np.int64
-    return Legs(
-        np.array(pair, whole),
-        np.array(a_ticks, whole),
-        np.array(b_ticks, whole),
-        np.array(is_back, bool),
-        np.zeros(len(rows), bool),
-        np.array(t_s, np.float64),
-    )

@@ -161,6 +161,14 @@ def unit_vectors(position_m: Array, first: Integers, second: Integers) -> Array:
     return np.asarray(apart / np.maximum(np.linalg.norm(apart, axis=1), 1e-9)[:, None])
 
 
+def distance_derivatives(position_m: Array, first: Integers, second: Integers) -> Array:
+    """Derivatives of the pairs' distances with respect to the positions, shape (pairs, n, 3)."""
+    rows, number = np.zeros((len(first), *position_m.shape)), np.arange(len(first))
+    unit = unit_vectors(position_m, first, second)
+    rows[number, first], rows[number, second] = unit, -unit
+    return rows
+
+
 def incidence(n: int, first: Integers, second: Integers) -> Array:
     """Incidence matrix of pairs and n anchors, shape (pairs, n): 1 where a pair contains an anchor."""
     rows = np.zeros((len(first), n))
@@ -181,14 +189,10 @@ def jacobian(problem: Problem, position_m: Array, weight: Array | None = None) -
     of_coordinate = 1.0 / np.sqrt(np.maximum(problem.coordinate_variance_m2, _MIN_STD_M**2)).ravel()
     known = np.flatnonzero((of_coordinate > 0.0) & problem.is_free.ravel())
     rows = np.zeros((m + t + n + len(known), 4 * n))
-    number = np.arange(m + t)
     first = np.concatenate([problem.first, problem.tape_first])
     second = np.concatenate([problem.second, problem.tape_second])
-    unit = unit_vectors(position_m, first, second)
-    factor = np.concatenate([of_range, of_tape])
-    for axis in range(3):
-        rows[number, 3 * first + axis] = factor * unit[:, axis]
-        rows[number, 3 * second + axis] = -factor * unit[:, axis]
+    of_position = distance_derivatives(position_m, first, second).reshape(m + t, 3 * n)
+    rows[: m + t, : 3 * n] = np.concatenate([of_range, of_tape])[:, None] * of_position
     rows[:m, 3 * n :] = of_range[:, None] * incidence(n, problem.first, problem.second)
     rows[m + t : m + t + n, 3 * n :] = delay_weights(problem)
     rows[m + t + n + np.arange(len(known)), known] = of_coordinate[known]

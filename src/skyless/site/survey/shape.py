@@ -11,7 +11,6 @@ from typing import Final
 import numpy as np
 from msgspec import Struct, structs
 from scipy.sparse.csgraph import connected_components
-from scipy.special import chdtri
 
 from skyless.core.arrays import Array, Integers, Mask
 from skyless.core.errors import SkylessError
@@ -29,22 +28,21 @@ from skyless.site.survey.fit import (
     weak_directions,
 )
 from skyless.site.survey.problem import (
-    MoreRows,
     Problem,
     Solution,
     delay_weights,
+    distance_derivatives,
     distances_m,
     incidence,
     jacobian,
     solve_least_squares,
     superimposed,
-    unit_vectors,
 )
 from skyless.site.survey.walk import TagEpochs, fit_with_tag
 
 # From ranges and facts to a ``Problem`` of some of the site's anchors.
 
-MIN_RANGE_STD_M: Final = 1e-5
+_MIN_RANGE_STD_M: Final = 1e-5
 _UNKNOWN_DELAY_STD_M: Final = 1e3  # standard deviation of a delay about which nothing is known
 _LARGEST_M: Final = 1e5
 """Limit of ranges, distances and standard deviations; with far larger ones the fit would not converge."""
@@ -179,15 +177,15 @@ def as_array(points: dict[int, Point], anchors: tuple[int, ...]) -> Array:
 
 
 def build_problem(
-    measured: Measured, kept: Integers, pair_std_m: float, point_m: Array | None, sketch_m: Array | None
-) -> tuple[Problem, list[PairRange]]:
+    measured: Measured, kept: Integers, point_m: Array | None = None, sketch_m: Array | None = None
+) -> tuple[Problem, tuple[PairRange, ...]]:
     """Build the problem of the kept anchors (indices). Returns it with the pairs of its ranges, in order.
 
     ``point_m``, ``sketch_m``: known and rough coordinates of the kept anchors, shape (k, 3), NaN where there are none.
     """
     facts, index = measured.facts, {measured.anchors[at]: number for number, at in enumerate(kept)}
     n = len(kept)
-    pairs = [pair for pair in measured.pairs if pair.a in index and pair.b in index]
+    pairs = tuple(pair for pair in measured.pairs if pair.a in index and pair.b in index)
     tapes = [tape for tape in measured.tapes if tape.a in index and tape.b in index]
     is_free = np.ones((n, 3), bool)
     coordinate = np.zeros((n, 3))
@@ -209,7 +207,7 @@ def build_problem(
         first=np.array([index[pair.a] for pair in pairs], np.int64),
         second=np.array([index[pair.b] for pair in pairs], np.int64),
         range_m=np.array([pair.range_m for pair in pairs], np.float64),
-        variance_m2=np.array([own_variance_m2(pair) + pair_std_m**2 for pair in pairs], np.float64),
+        variance_m2=np.array([_own_variance_m2(pair) + facts.pair_std_m**2 for pair in pairs], np.float64),
         delay_variance_m2=facts.delay_std_m**2 + stamp_variance,
         common_delay_m=facts.common_delay_std_m if facts.delay_std_m > 0.0 else 0.0,
         coordinate_m=coordinate,
@@ -222,9 +220,9 @@ def build_problem(
     return problem, pairs
 
 
-def own_variance_m2(pair: PairRange) -> float:
+def _own_variance_m2(pair: PairRange) -> float:
     """Variance of a range without the constant error of a pair."""
-    return pair.std_m**2 + (_OFTEN_LATE_STD_M * pair.late_share) ** 2 + MIN_RANGE_STD_M**2
+    return pair.std_m**2 + (_OFTEN_LATE_STD_M * pair.late_share) ** 2 + _MIN_RANGE_STD_M**2
 
 
 def with_free_delays(problem: Problem) -> tuple[Problem, Mask]:
@@ -411,31 +409,24 @@ class Framed(Struct, frozen=True, eq=False):
     notes: tuple[str, ...]
 
 
-def in_frame(
-    measured: Measured,
-    kept: Integers,
-    position_m: Array,
-    covariance_m2: Array,
-    core: Mask,
-    points_used: tuple[int, ...],
-) -> Framed:
-    """Move positions, shape (k, 3), and their covariance, shape (4 k, 4 k), to the frame that the facts define."""
-    anchors = np.array([measured.anchors[index] for index in kept])
-    motion, sentence, gauge, notes = _motion(measured, anchors, position_m, core, points_used)
-    k = len(kept)
-    blocks = covariance_m2[: 3 * k, : 3 * k].reshape(k, 3, k, 3)[np.arange(k), :, np.arange(k)]
+def in_frame(fitted: "Fitted") -> Framed:
+    """Move positions and their covariance to the frame that the facts define."""
+    motion, sentence, gauge, notes = _motion(fitted)
+    k = len(fitted.kept)
+    blocks = fitted.covariance_m2[: 3 * k, : 3 * k].reshape(k, 3, k, 3)[np.arange(k), :, np.arange(k)]
     rotated = motion.rotation @ blocks @ motion.rotation.T
-    return Framed(motion, motion.moved(position_m), rotated, sentence, gauge, tuple(notes))
+    return Framed(motion, motion.moved(fitted.solution.position_m), rotated, sentence, gauge, tuple(notes))
 
 
-def _motion(
-    measured: Measured, anchors: Integers, position_m: Array, core: Mask, points_used: tuple[int, ...]
-) -> tuple[Motion, str, Gauge | None, list[str]]:
-    axes = 2 if levels(measured) else 3
+def _motion(fitted: "Fitted") -> tuple[Motion, str, Gauge | None, list[str]]:
+    measured, position_m, core = fitted.measured, fitted.solution.position_m, fitted.core
+    anchors, axes = np.array(fitted.anchors), 2 if levels(measured) else 3
     still = Motion(np.eye(3), np.zeros(3))
     facts = measured.facts
-    by_points, points_decide = _best(facts.points, max(facts.point_std_m, 0.03), anchors, position_m, core, axes)
-    by_sketch, sketch_decides = _best(facts.sketch_m, facts.sketch_std_m, anchors, position_m, core, axes)
+    if facts.keep_positions:
+        return still, "positions are the given ones, which stay", None, []
+    by_points, points_decide = _best(fitted, facts.points, max(facts.point_std_m, 0.03), axes)
+    by_sketch, sketch_decides = _best(fitted, facts.sketch_m, facts.sketch_std_m, axes)
     decided = points_decide or sketch_decides
     notes: list[str] = []
     if axes == 3:
@@ -447,15 +438,15 @@ def _motion(
         missing = [anchor for anchor in dict.fromkeys(named) if anchor not in index]
         if not missing and len(set(named)) == len(named):
             chosen = [index[anchor] for anchor in named]
-            return _by_gauge(anchors, position_m, core, axes, chosen, by_points or by_sketch, decided, notes)
+            return _by_gauge(fitted, axes, chosen, by_points or by_sketch, decided, notes)
         has = "has" if len(missing) == 1 else "have"
         why = f"{anchors_named(missing)} {has} no position" if missing else "one anchor is named twice"
         notes.append(f"the frame cannot be defined by anchors {joined(named)}: {why}")
     mirror = "" if decided else "; the ranges do not show whether this is a mirror image: name an anchor on the left"
     if by_points is not None:
-        motion = still if points_used else by_points
+        motion = still if fitted.points_used else by_points
         if not decided and axes == 2:
-            motion = _left_of_points(measured, anchors, motion, position_m, core)
+            motion = _left_of_points(fitted, motion)
         return motion, f"axes follow the known points{mirror}", None, notes
     if by_sketch is not None:
         return by_sketch, f"axes fit the sketch best{mirror}", None, notes
@@ -470,19 +461,11 @@ _MIRROR = "no anchors are named for the origin and the axes, and the result may 
 
 
 def _by_gauge(
-    anchors: Integers,
-    position_m: Array,
-    core: Mask,
-    axes: int,
-    chosen: list[int],
-    known: Motion | None,
-    decided: bool,
-    notes: list[str],
+    fitted: "Fitted", axes: int, chosen: list[int], known: Motion | None, decided: bool, notes: list[str]
 ) -> tuple[Motion, str, Gauge | None, list[str]]:
     """Frame through named anchors; if none is named for the left, points or the sketch decide the mirror image."""
-    origin, x_axis = chosen[:2]
-    if known is not None:
-        position_m = known.moved(position_m)
+    anchors, core, (origin, x_axis) = np.array(fitted.anchors), fitted.core, chosen[:2]
+    position_m = fitted.solution.position_m if known is None else known.moved(fitted.solution.position_m)
     length = np.linalg.norm((position_m - position_m[origin])[:, :axes], axis=1)
     far = int(np.argmax(np.where(core, length, 0.0)))
     if length[x_axis] < _NEAR * length[far]:
@@ -508,10 +491,11 @@ def _by_gauge(
     return found.motion, sentence, _gauge_of(found, anchors), notes
 
 
-def _left_of_points(measured: Measured, anchors: Integers, motion: Motion, position_m: Array, core: Mask) -> Motion:
+def _left_of_points(fitted: "Fitted", motion: Motion) -> Motion:
     """The motion, mirrored if need be so that the first anchor clearly off the points' line is on its left."""
-    given = [number for number, anchor in enumerate(anchors) if int(anchor) in measured.facts.points and core[number]]
-    moved = motion.moved(position_m)
+    points, core = fitted.measured.facts.points, fitted.core
+    given = [number for number, anchor in enumerate(fitted.anchors) if anchor in points and core[number]]
+    moved = motion.moved(fitted.solution.position_m)
     found = axes_through(moved, core, 2, given[0], given[1])
     if np.linalg.det(found.motion.rotation) > 0.0:
         return motion
@@ -523,12 +507,10 @@ def _left_of_points(measured: Measured, anchors: Integers, motion: Motion, posit
     return Motion(mirror @ motion.rotation, whole.moved(motion.shift_m))
 
 
-def _best(
-    points: dict[int, Point], std_m: float, anchors: Integers, position_m: Array, core: Mask, axes: int
-) -> tuple[Motion | None, bool]:
+def _best(fitted: "Fitted", points: dict[int, Point], std_m: float, axes: int) -> tuple[Motion | None, bool]:
     """The best motion to these points, None if they are too few, and whether they exclude the mirror image."""
-    there_m = as_array(points, tuple(anchors.tolist()))
-    known = core & np.isfinite(there_m[:, :axes]).all(axis=1)
+    there_m, position_m = as_array(points, fitted.anchors), fitted.solution.position_m
+    known = fitted.core & np.isfinite(there_m[:, :axes]).all(axis=1)
     if known.sum() < axes:
         return None, False
     there_m = np.where(np.isfinite(there_m), there_m, position_m)
@@ -651,29 +633,18 @@ def _levelled(position_m: Array, height_m: Array) -> Array:
 # The shape: a fit of all anchors with enough ranges
 
 
-_MIN_REDUNDANCY: Final = 4  # spare ranges needed to judge the ranges by their residuals
-_FALSE_ALARM: Final = 0.01
-"""Share of sites whose ranges are as good as stated but whose residuals seem to contradict that."""
-
-_MAX_ROUNDS: Final = 4
-
 _BENDS_M: Final = 0.03
 _BENT_SIGMAS: Final = (-1.0, -0.5, 0.5, 1.0)
 """A shape with at least this standard deviation is also examined when bent by these multiples of it."""
 
 
-class Fitted(Struct, frozen=True, eq=False):
+class Fitted(RobustFit, frozen=True, eq=False):
     """The fit of the ``k`` anchors that have enough ranges, and its covariance."""
 
     measured: Measured
     kept: Integers
     """Shape (k,): indices of the fitted anchors."""
-    robust: RobustFit
-    problem: Problem
     pairs: tuple[PairRange, ...]
-    solution: Solution
-    used: Mask
-    """Shape (m,): ranges in use."""
     core: Mask
     """Shape (k,): determined anchors."""
     covariance_m2: Array
@@ -687,70 +658,85 @@ class Fitted(Struct, frozen=True, eq=False):
         """Identifiers of the fitted anchors."""
         return tuple(self.measured.anchors[index] for index in self.kept)
 
+    @property
+    def silent(self) -> tuple[int, ...]:
+        """Fitted anchors without a range, whose delays nothing shows."""
+        ranged = {anchor for pair in self.pairs for anchor in (pair.a, pair.b)}
+        return tuple(anchor for anchor in self.anchors if anchor not in ranged)
+
 
 def fit_shape(measured: Measured, kept: Integers) -> Fitted:
     """Fit the shape, first without and then with known points, with the range error that the residuals show."""
-    facts = measured.facts
     anchors = tuple(measured.anchors[index] for index in kept)
-    sketch = as_array(facts.sketch_m, anchors) if facts.sketch_m else None
-    point = as_array(facts.points, anchors)
-    range_std_m = facts.pair_std_m
-    notes: list[str] = []
-    extra: list[Array] = []
-    is_held = np.zeros(len(kept), bool)
-    if np.isfinite(point[:, :2]).all(axis=1).any():
-        free = _round(measured, kept, range_std_m, None, sketch, [])
-        is_held, moved, sketch, notes = _held_by_points(free, point, sketch)
-        extra = [] if moved is None else [moved]
-    held = np.where(is_held[:, None], point, np.nan)
-    for _ in range(_MAX_ROUNDS):
-        fitted = _round(measured, kept, range_std_m, held if is_held.any() else None, sketch, extra)
-        shown = _shown_std_m(fitted)
-        if shown <= fitted.robust.range_std_m:
-            break
-        range_std_m = shown
+    sketch = as_array(measured.facts.sketch_m, anchors) if measured.facts.sketch_m else None
+    point = as_array(measured.facts.points, anchors)
+    if not np.isfinite(point[:, :2]).all(axis=1).any():
+        return _round(measured, kept, sketch)
+    is_held, moved, sketch, notes = _held_by_points(_round(measured, kept, sketch), point, sketch)
     used = tuple(anchor for anchor, chosen in zip(anchors, is_held, strict=True) if chosen)
-    return structs.replace(fitted, points_used=used, notes=tuple(notes))
+    fitted = _round(measured, kept, sketch, used, () if moved is None else (moved,))
+    return structs.replace(fitted, notes=tuple(notes))
 
 
 def _round(
     measured: Measured,
     kept: Integers,
-    range_std_m: float,
-    point: Array | None,
     sketch: Array | None,
-    extra: list[Array],
+    points_used: tuple[int, ...] = (),
+    extra: tuple[Array, ...] = (),
 ) -> Fitted:
-    problem, pairs = build_problem(measured, kept, range_std_m, point, sketch)
+    """Fit the shape with these points; ``extra``: further starts."""
+    problem, pairs = build_problem(measured, kept, _points(measured, kept, points_used), sketch)
     # Starts only need the sketch; known points take part in the fit.
-    robust = fit_robustly(problem, [*start_positions(problem, sketch), *extra], range_std_m)
-    problem, solution, used = robust.problem, robust.solution, robust.used
+    robust = fit_robustly(problem, [*start_positions(problem, sketch), *extra], measured.facts.pair_std_m)
     if sketch is not None:
-        solution = _in_sketch_frame(problem, solution, robust.weight, sketch)
-        robust = structs.replace(robust, solution=solution)
-    core, covariance = _determined(measured, kept, problem, solution, used, point)
-    return Fitted(measured, kept, robust, problem, tuple(pairs), solution, used, core, covariance)
+        robust = structs.replace(robust, solution=_in_sketch_frame(robust, sketch))
+    return _determined(_fitted(measured, kept, robust, pairs, points_used))
 
 
-def _determined(
-    measured: Measured, kept: Integers, problem: Problem, solution: Solution, used: Mask, point: Array | None
-) -> tuple[Mask, Array]:
-    """Mask of the determined anchors, and the covariance aligned over them."""
-    weight = used.astype(np.float64)
-    surveyed = structs.replace(problem, coordinate_variance_m2=_without_sketch(measured, kept, point))
-    least = 1 if point is not None else 3 if levels(measured) else 4
+def _fitted(
+    measured: Measured,
+    kept: Integers,
+    robust: RobustFit,
+    pairs: tuple[PairRange, ...],
+    points_used: tuple[int, ...] = (),
+) -> Fitted:
+    """The fit with all anchors in the core, before its covariance is known."""
+    everyone, unknown = np.ones(len(kept), bool), np.zeros((0, 0))
+    return Fitted(
+        **structs.asdict(robust),
+        measured=measured,
+        kept=kept,
+        pairs=pairs,
+        core=everyone,
+        covariance_m2=unknown,
+        points_used=points_used,
+    )
+
+
+def _determined(fitted: Fitted) -> Fitted:
+    """The fit with its determined anchors, and the covariance aligned over them; kept positions stay determined."""
+    measured, problem, solution = fitted.measured, fitted.problem, fitted.solution
+    if measured.facts.keep_positions:
+        return structs.replace(fitted, covariance_m2=_covariance_of_kept(fitted))
+    weight, surveyed, everyone = (
+        fitted.used.astype(np.float64),
+        surveyed_problem(fitted),
+        np.ones(len(fitted.kept), bool),
+    )
+    least = 1 if fitted.points_used else 3 if levels(measured) else 4
     core = determined_core(surveyed, solution.position_m, least, weight)
-    aligned_over = core if core.any() else np.ones(len(kept), bool)
+    aligned_over = core if core.any() else everyone
     covariance = aligned_covariance(surveyed, solution.position_m, aligned_over, weight)
     for direction in weak_directions(surveyed, covariance, core, 0.02, 4):
         if folds(surveyed, solution.position_m, solution.delay_m, weight, direction):
             core = core & ~direction.anchors
     flat = may_be_flat(surveyed, solution.position_m, solution.delay_m, weight, 2 if levels(measured) else 3)
     if core.sum() < least or flat:
-        core = np.zeros(len(kept), bool)
+        core = ~everyone
     if core.any():
         covariance = _largest_nearby(problem, solution.position_m, weight, core)
-    return core, covariance
+    return structs.replace(fitted, core=core, covariance_m2=covariance)
 
 
 def _largest_nearby(problem: Problem, position_m: Array, weight: Array, core: Mask) -> Array:
@@ -765,30 +751,14 @@ def _largest_nearby(problem: Problem, position_m: Array, weight: Array, core: Ma
     return max(found, key=lambda one: float(np.trace(one[: 3 * len(core), : 3 * len(core)])))
 
 
-def with_tag(fitted: Fitted, rows: MoreRows, solution: Solution, used: Mask) -> Fitted:
-    """The shape with a tag's rows, for a solution that includes them; kept positions stay determined."""
-    problem = structs.replace(fitted.problem, more=(*fitted.problem.more, rows))
-    fitted = structs.replace(fitted, problem=problem, solution=solution, used=used)
-    if fitted.measured.facts.keep_positions:
-        return fitted
-    core, covariance = _determined(fitted.measured, fitted.kept, problem, solution, used, _points(fitted))
-    return structs.replace(fitted, core=core, covariance_m2=covariance)
-
-
-def _in_sketch_frame(problem: Problem, solution: Solution, weight: Array, sketch: Array) -> Solution:
-    known = np.isfinite(sketch[:, :2]).all(axis=1)
+def _in_sketch_frame(robust: RobustFit, sketch: Array) -> Solution:
+    known, problem, position_m = np.isfinite(sketch[:, :2]).all(axis=1), robust.problem, robust.solution.position_m
     if known.sum() < 2:
-        return solution
+        return robust.solution
     axes = 3 if problem.is_free[:, 2].all() and np.isfinite(sketch[known]).all() and known.sum() > 2 else 2
-    there = np.where(np.isfinite(sketch), sketch, solution.position_m)
-    moved = align(solution.position_m[known], there[known], 0.3, axes)[0].moved(solution.position_m)
-    moved = np.where(problem.is_free, moved, solution.position_m)
-    return solve_least_squares(problem, moved, weight)
-
-
-def _without_sketch(measured: Measured, kept: Integers, point: Array | None) -> Array:
-    """Variances of known coordinates, shape (k, 3), infinite for those of the sketch."""
-    return build_problem(measured, kept, 0.0, point, None)[0].coordinate_variance_m2
+    there = np.where(np.isfinite(sketch), sketch, position_m)
+    moved = align(position_m[known], there[known], 0.3, axes)[0].moved(position_m)
+    return solve_least_squares(problem, np.where(problem.is_free, moved, position_m), robust.weight)
 
 
 def _held_by_points(
@@ -839,28 +809,14 @@ def _moved_sketch(sketch: Array | None, motion: Motion) -> Array | None:
     return np.where(np.isnan(sketch), np.nan, motion.moved(np.concatenate([sketch[:, :2], flat], axis=1)))
 
 
-def _shown_std_m(fitted: Fitted) -> float:
-    """Constant error of a pair from the residuals, if they contradict the assumed one; otherwise 0."""
-    problem, used = fitted.problem, fitted.used
-    position_m, weight = fitted.solution.position_m, used.astype(np.float64)
-    covariance = aligned_covariance(problem, position_m, np.ones(len(position_m), bool), weight)
-    rows = jacobian(problem, position_m, weight)[: len(used)]
-    freedom = float(used.sum()) - float(np.einsum("ij,jk,ik->", rows, covariance, rows, optimize=True))
-    squares = fitted.solution.residual_m[used] ** 2
-    noise = np.array([own_variance_m2(pair) for pair in fitted.pairs])[used]
-    if redundancy(fitted) < _MIN_REDUNDANCY or freedom < 1.0:
-        return 0.0
-    if float(np.sum(squares / problem.variance_m2[used])) <= chdtri(freedom, _FALSE_ALARM):
-        return 0.0
-    low, high = 0.0, 10.0 * math.sqrt(float(squares.max()))
-    for _ in range(60):
-        middle = 0.5 * (low + high)
-        low, high = (middle, high) if np.sum(squares / (noise + middle**2)) > freedom else (low, middle)
-    return high
-
-
 def redundancy(fitted: Fitted) -> int:
-    """Measurements in use less the unknowns that they determine; delays known as well as a range are no unknowns."""
+    """Measurements in use less the unknowns that they determine; delays known as well as a range are no unknowns.
+
+    If positions are kept, all delays count as unknown, as the errors of positions make every range a poor one.
+    """
+    if fitted.measured.facts.keep_positions:
+        delays = incidence(len(fitted.kept), fitted.problem.first, fitted.problem.second)[fitted.used]
+        return len(delays) - int(np.linalg.matrix_rank(delays)) if len(delays) else 0
     problem, _ = with_free_delays(surveyed_problem(fitted))
     rows = jacobian(problem, fitted.solution.position_m, fitted.used.astype(np.float64))
     return int(np.any(rows != 0.0, axis=1).sum()) - rank(rows)
@@ -868,13 +824,15 @@ def redundancy(fitted: Fitted) -> int:
 
 def surveyed_problem(fitted: Fitted) -> Problem:
     """The problem without the sketch, which determines nothing."""
-    variance = _without_sketch(fitted.measured, fitted.kept, _points(fitted))
+    points = _points(fitted.measured, fitted.kept, fitted.points_used)
+    variance = build_problem(fitted.measured, fitted.kept, points)[0].coordinate_variance_m2
     return structs.replace(fitted.problem, coordinate_variance_m2=variance)
 
 
-def _points(fitted: Fitted) -> Array | None:
-    points = {anchor: fitted.measured.facts.points[anchor] for anchor in fitted.points_used}
-    return as_array(points, fitted.anchors) if points else None
+def _points(measured: Measured, kept: Integers, used: tuple[int, ...]) -> Array | None:
+    """Coordinates of the points in use, shape (k, 3), NaN for other anchors; None without any."""
+    points = {anchor: measured.facts.points[anchor] for anchor in used}
+    return as_array(points, tuple(measured.anchors[index] for index in kept)) if points else None
 
 
 def with_tags(fitted: Fitted, others: tuple[OtherFit, ...]) -> tuple[Fitted, tuple[OtherFit, ...]]:
@@ -893,7 +851,9 @@ def with_tags(fitted: Fitted, others: tuple[OtherFit, ...]) -> tuple[Fitted, tup
         if joint.solution is not None and joint.rows is not None:
             if joint.chosen:
                 notes = (*notes, f"{epochs.name} contradicts the result that fits the ranges best: another was chosen")
-            fitted = with_tag(fitted, joint.rows, joint.solution, used[joint.chosen])
+            problem = structs.replace(fitted.problem, more=(*fitted.problem.more, joint.rows))
+            fitted = structs.replace(fitted, problem=problem, solution=joint.solution, used=used[joint.chosen])
+            fitted = _determined(fitted)
             others = tuple(others[number - 1] for number in joint.possible if number and number != joint.chosen)
         fitted = structs.replace(fitted, notes=notes)
     return fitted, others
@@ -902,10 +862,12 @@ def with_tags(fitted: Fitted, others: tuple[OtherFit, ...]) -> tuple[Fitted, tup
 # Only delays, of anchors whose positions are kept
 
 
-def fit_delays(measured: Measured, kept: Integers, position_m: Array) -> Fitted:
-    """Fit the delays of anchors whose positions, shape (k, 3), stay; their errors count as errors of the ranges."""
+def fit_delays(measured: Measured, kept: Integers) -> Fitted:
+    """Fit the delays of anchors whose positions, those of the sketch, stay; their errors count as errors of ranges."""
     facts = measured.facts
-    problem, pairs = build_problem(measured, kept, facts.pair_std_m, None, None)
+    position_m = as_array(facts.sketch_m, tuple(measured.anchors[index] for index in kept))
+    position_m[:, 2] = np.where(np.isnan(position_m[:, 2]), fixed_heights_m(measured)[kept], position_m[:, 2])
+    problem, pairs = build_problem(measured, kept)
     problem = structs.replace(
         problem,
         is_free=np.zeros((len(kept), 3), bool),
@@ -913,12 +875,13 @@ def fit_delays(measured: Measured, kept: Integers, position_m: Array) -> Fitted:
         variance_m2=problem.variance_m2 + 2.0 * facts.sketch_std_m**2,
     )
     fit = fit_robustly(problem, [position_m], math.hypot(facts.pair_std_m, math.sqrt(2.0) * facts.sketch_std_m))
-    core, covariance = np.ones(len(kept), bool), np.zeros((4 * len(kept), 4 * len(kept)))
-    return Fitted(measured, kept, fit, fit.problem, tuple(pairs), fit.solution, fit.used, core, covariance)
+    range_m2 = max(fit.range_std_m**2 - 2.0 * facts.sketch_std_m**2, facts.pair_std_m**2)
+    robust = structs.replace(fit, range_std_m=math.sqrt(range_m2))
+    return _determined(_fitted(measured, kept, robust, pairs))
 
 
-def delay_covariance(fitted: Fitted) -> Array:
-    """Covariance of the delays, shape (k, k), with errors of kept positions, which all ranges of an anchor share."""
+def _covariance_of_kept(fitted: Fitted) -> Array:
+    """Covariance of kept positions, and of delays with the positions' errors, which an anchor's ranges share."""
     problem, solution, facts = fitted.problem, fitted.solution, fitted.measured.facts
     k, m, dimensions = len(fitted.kept), len(problem.first), facts.dimensions
     of_tags = np.zeros((4 * k, 4 * k))
@@ -932,11 +895,12 @@ def delay_covariance(fitted: Fitted) -> Array:
     prior = delay_weights(problem).T @ delay_weights(problem)
     inverse = np.linalg.inv(delays.T @ (weight[:, None] * delays) + prior + of_tags)
     gain = inverse @ (delays.T * weight)
-    unit = unit_vectors(solution.position_m, problem.first, problem.second)[:, :dimensions]
-    shift, number = np.zeros((m, k, dimensions)), np.arange(m)
-    shift[number, problem.first], shift[number, problem.second] = unit, -unit
-    moved = gain @ shift.reshape(m, -1) + inverse @ by_tags.reshape(k, -1)
+    shift = distance_derivatives(solution.position_m, problem.first, problem.second)[:, :, :dimensions]
+    moved = gain @ shift.reshape(m, k * dimensions) + inverse @ by_tags.reshape(k, -1)
     noise = np.maximum(problem.variance_m2 - 2.0 * facts.sketch_std_m**2, 0.0)
-    return np.asarray(
+    covariance = np.zeros((4 * k, 4 * k))
+    covariance[: 3 * k, : 3 * k] = np.diag(np.tile(np.arange(3) < dimensions, k) * facts.sketch_std_m**2)
+    covariance[3 * k :, 3 * k :] = (
         (gain * noise) @ gain.T + facts.sketch_std_m**2 * moved @ moved.T + inverse @ (prior + of_tags) @ inverse
     )
+    return covariance

@@ -25,7 +25,6 @@ from skyless.site.survey.facts import (
     Survey,
     SurveyedAnchor,
     SurveyedPair,
-    TapeAdvice,
     anchors_named,
     are,
     distances_named,
@@ -41,21 +40,18 @@ from skyless.site.survey.fit import (
     count_links,
     find_ambiguities,
     max_std_m,
-    mending_tapes,
     position_stds_m,
     weak_directions,
 )
-from skyless.site.survey.problem import Problem, adjacency, delay_weights, incidence
+from skyless.site.survey.problem import Problem, adjacency, delay_weights
 from skyless.site.survey.shape import (
     Fitted,
     Framed,
     Measured,
     as_array,
     assumed_heights,
-    delay_covariance,
     fit_delays,
     fit_shape,
-    fixed_heights_m,
     in_frame,
     levels,
     own_delays,
@@ -93,27 +89,30 @@ def run_survey(ranges: PairRanges, facts: Facts) -> Survey:
 
 
 def _survey(measured: Measured) -> Survey:
-    if measured.facts.keep_positions:
-        return survey_of_kept_positions(measured)
-    links = _links(measured)
-    kept = np.flatnonzero(links.has_enough)
+    links, keeps = _links(measured), measured.facts.keep_positions
+    is_placed = [anchor in measured.facts.sketch_m for anchor in measured.anchors]
+    kept = np.flatnonzero(is_placed if keeps else links.has_enough)
     fitted_ids = {measured.anchors[index] for index in kept}
-    if not any(pair.a in fitted_ids and pair.b in fitted_ids for pair in measured.pairs):
+    if not len(kept) or not (keeps or any({pair.a, pair.b} <= fitted_ids for pair in measured.pairs)):
         return _nothing(measured, links, None)
-    fitted = fit_shape(measured, kept)
-    fitted, others = with_tags(fitted, find_ambiguities(fitted.robust))
+    fitted = fit_delays(measured, kept) if keeps else fit_shape(measured, kept)
+    fitted, others = with_tags(fitted, () if keeps else find_ambiguities(fitted))
     if not fitted.core.any():
         return _nothing(measured, links, fitted)
-    framed = in_frame(measured, kept, fitted.solution.position_m, fitted.covariance_m2, fitted.core, fitted.points_used)
+    framed, at_m, covariance_m2 = in_frame(fitted), fitted.solution.position_m, fitted.covariance_m2
     return Survey(
         anchors=_anchors(measured, links, fitted, framed),
         pairs=_pairs(measured, fitted),
-        range_std_m=fitted.robust.range_std_m,
+        range_std_m=fitted.range_std_m,
         redundancy=redundancy(fitted),
         unchecked=_unchecked(fitted),
-        not_determined=(*_missing_sentences(measured, links, fitted), *_held_by_expected_delays(fitted, framed)),
+        not_determined=(
+            *_missing_sentences(measured, links, fitted),
+            *_silent_sentence(fitted),
+            *_held_by_expected_delays(fitted, framed),
+        ),
         ambiguities=_ambiguities(fitted, framed, others),
-        tapes=_advised_tapes(fitted),
+        tapes=() if keeps else tuple(best_tapes(fitted.problem, fitted.anchors, at_m, covariance_m2, fitted.core)[0]),
         frame=framed.sentence,
         gauge=framed.gauge,
         notes=(*measured.notes, *fitted.notes, *framed.notes),
@@ -140,7 +139,9 @@ def _links(measured: Measured) -> Links:
 def _anchors(measured: Measured, links: Links, fitted: Fitted, framed: Framed) -> tuple[SurveyedAnchor, ...]:
     reasons = _anchor_reasons(measured, links, fitted)
     number = {anchor: k for k, anchor in enumerate(fitted.anchors)}
-    stds = position_stds_m(fitted.problem, fitted.covariance_m2)
+    stds, silent = position_stds_m(fitted.problem, fitted.covariance_m2), fitted.silent
+    if measured.facts.keep_positions:
+        stds = np.full(len(number), measured.facts.sketch_std_m)
     covariance_of_delays = fitted.covariance_m2[3 * len(number) :, 3 * len(number) :]
     delays, delay_stds = own_delays(
         measured, fitted.anchors, fitted.problem, fitted.solution.delay_m, covariance_of_delays
@@ -161,8 +162,8 @@ def _anchors(measured: Measured, links: Links, fitted: Fitted, framed: Framed) -
                 z_m=z,
                 std_m=float(stds[k]),
                 covariance_m2=tuple(tuple(row) for row in framed.covariance_m2[k].tolist()),
-                delay_m=float(delays[k]),
-                delay_std_m=float(delay_stds[k]),
+                delay_m=None if anchor in silent else float(delays[k]),
+                delay_std_m=None if anchor in silent else float(delay_stds[k]),
             )
         )
     return tuple(found)
@@ -242,84 +243,11 @@ def _nothing(measured: Measured, links: Links, fitted: Fitted | None) -> Survey:
             SurveyedAnchor(anchor, determined=False, reason=reasons.get(anchor)) for anchor in measured.anchors
         ),
         pairs=_pairs(measured, fitted),
-        range_std_m=measured.facts.pair_std_m if fitted is None else fitted.robust.range_std_m,
+        range_std_m=measured.facts.pair_std_m if fitted is None else fitted.range_std_m,
         unchecked="nothing checks this survey: no anchor is determined",
         not_determined=_missing_sentences(measured, links, fitted),
         frame="no anchor is determined, so there is no frame",
         notes=measured.notes if fitted is None else (*measured.notes, *fitted.notes),
-    )
-
-
-# Only delays, of anchors whose positions are kept
-
-
-_NO_POSITION = "no position is given for it"
-
-
-def survey_of_kept_positions(measured: Measured) -> Survey:
-    """Estimate only delays; positions are those of the sketch, and anchors without one have no figures."""
-    facts = measured.facts
-    sketch = as_array(facts.sketch_m, measured.anchors)
-    sketch[:, 2] = np.where(np.isnan(sketch[:, 2]), fixed_heights_m(measured), sketch[:, 2])
-    kept = np.flatnonzero(np.isfinite(sketch[:, :2]).all(axis=1))
-    ids = tuple(measured.anchors[index] for index in kept)
-    pairs = [pair for pair in measured.pairs if {pair.a, pair.b} <= set(ids)]
-    linked = {anchor for pair in pairs for anchor in (pair.a, pair.b)}
-    delays: dict[int, tuple[float, float]] = {}
-    residuals: dict[tuple[int, int], tuple[float | None, bool]] = {}
-    redundancy, range_std_m = 0, facts.pair_std_m
-    notes: tuple[str, ...] = ()
-    if pairs:
-        fit, _ = with_tags(fit_delays(measured, kept, sketch[kept]), ())
-        notes = fit.notes
-        own, std = own_delays(measured, ids, fit.problem, fit.solution.delay_m, delay_covariance(fit))
-        delays = {anchor: (float(own[k]), float(std[k])) for k, anchor in enumerate(ids) if anchor in linked}
-        for index, pair in enumerate(pairs):
-            residuals[pair.a, pair.b] = float(fit.solution.residual_m[index]), not fit.used[index]
-        delays_in_use = incidence(len(ids), fit.problem.first, fit.problem.second)[fit.used]
-        redundancy = int(fit.used.sum()) - int(np.linalg.matrix_rank(delays_in_use))
-        range_std_m = math.sqrt(max(fit.robust.range_std_m**2 - 2.0 * facts.sketch_std_m**2, facts.pair_std_m**2))
-    kept_pairs = []
-    for pair in measured.pairs:
-        residual_m, excluded = residuals.get((pair.a, pair.b), (None, False))
-        std_m = math.sqrt(pair.std_m**2 + facts.pair_std_m**2 + 2.0 * facts.sketch_std_m**2)
-        kept_pairs.append(SurveyedPair(pair.a, pair.b, pair.range_m, residual_m, std_m, excluded))
-    missing = [anchor for anchor in measured.anchors if anchor not in ids]
-    silent = [anchor for anchor in ids if anchor not in linked]
-    sentences = [f"{anchors_named(missing)} {are(missing)} not determined: {_NO_POSITION}"] if missing else []
-    if silent:
-        sentences.append(f"delays of {anchors_named(silent)} are not determined: no range to an anchor with a position")
-    return Survey(
-        anchors=tuple(_kept_anchor(measured, anchor, sketch[k], delays) for k, anchor in enumerate(measured.anchors)),
-        pairs=tuple(kept_pairs),
-        range_std_m=range_std_m,
-        redundancy=redundancy,
-        unchecked=None if redundancy >= MIN_CHECKS else "too few ranges check these delays",
-        not_determined=tuple(sentences),
-        frame="positions are the given ones, which stay",
-        notes=(*measured.notes, *notes),
-    )
-
-
-def _kept_anchor(
-    measured: Measured, anchor: int, position_m: Array, delays: dict[int, tuple[float, float]]
-) -> SurveyedAnchor:
-    if not np.isfinite(position_m).all():
-        return SurveyedAnchor(anchor, determined=False, reason=_NO_POSITION)
-    facts = measured.facts
-    x, y, z = position_m.tolist()
-    delay, std = delays.get(anchor, (None, None))
-    variances = np.where(np.arange(3) < facts.dimensions, facts.sketch_std_m**2, 0.0)
-    return SurveyedAnchor(
-        anchor,
-        determined=True,
-        x_m=x,
-        y_m=y,
-        z_m=z,
-        std_m=facts.sketch_std_m,
-        covariance_m2=tuple(tuple(row) for row in np.diag(variances).tolist()),
-        delay_m=delay,
-        delay_std_m=std,
     )
 
 
@@ -352,6 +280,8 @@ def _anchor_reasons(measured: Measured, links: Links, fitted: Fitted | None) -> 
     """Why each anchor, by identifier, is not determined."""
     names = measured.anchors
     inside = set() if fitted is None else set(fitted.kept.tolist())
+    if measured.facts.keep_positions:
+        return {anchor: "no position is given for it" for index, anchor in enumerate(names) if index not in inside}
     reasons = {}
     for index, anchor in enumerate(names):
         others = [names[other] for other in np.flatnonzero(links.adjacent[index])]
@@ -411,9 +341,15 @@ def _missing_sentences(measured: Measured, links: Links, fitted: Fitted | None) 
     return tuple(sentences)
 
 
+def _silent_sentence(fitted: Fitted) -> tuple[str, ...]:
+    if not fitted.silent:
+        return ()
+    return (f"delays of {anchors_named(fitted.silent)} are not determined: no range to an anchor with a position",)
+
+
 def _distances_to_measure(measured: Measured, links: Links, fitted: Fitted | None, anchors: list[int]) -> str:
     """Which measured distances would determine these anchors."""
-    if fitted is None or len(fitted.anchors) < 3:
+    if fitted is None or len(fitted.anchors) < 3 or measured.facts.keep_positions:
         return ""
     placed = [index for index, fixed in zip(fitted.kept.tolist(), fitted.core, strict=True) if fixed]
     if not placed:
@@ -431,9 +367,10 @@ def _distances_to_measure(measured: Measured, links: Links, fitted: Fitted | Non
 
 
 def _mending(fitted: Fitted, problem: Problem, position_m: Array, covariance_m2: Array, core: Mask) -> str:
-    """Advice to measure the distances that would determine all anchors of the core."""
-    tapes = mending_tapes(problem, position_m, covariance_m2, core)
-    return _advised([(fitted.anchors[tape.first], fitted.anchors[tape.second]) for tape in tapes])
+    """Advice to measure the distances that would determine all anchors of the core; none if six are not enough."""
+    most_m = max_std_m(problem)
+    tapes, worst_m = best_tapes(problem, fitted.anchors, position_m, covariance_m2, core, most=6, until_m=most_m)
+    return _advised([(tape.a, tape.b) for tape in tapes] if worst_m <= most_m else [])
 
 
 def _far_apart(near: list[int], placed: list[int], fitted: Fitted, count: int) -> list[int]:
@@ -545,12 +482,3 @@ def _unchecked(fitted: Fitted) -> str | None:
             "this survey"
         )
     return None
-
-
-def _advised_tapes(fitted: Fitted) -> tuple[TapeAdvice, ...]:
-    """The three distances that would help most, each given those before it."""
-    found = []
-    for one in best_tapes(fitted.problem, fitted.solution.position_m, fitted.covariance_m2, fitted.core):
-        a, b = sorted((fitted.anchors[one.first], fitted.anchors[one.second]))
-        found.append(TapeAdvice(a, b, one.std_before_m, one.std_after_m))
-    return tuple(found)

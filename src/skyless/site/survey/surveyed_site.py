@@ -82,11 +82,6 @@ def surveyed_text(text: str, survey: Survey, site: Site, path: str | PathLike[st
     return with_values(text, of_anchors, {"accuracy": accuracy} if accuracy else {}, path, "the survey")
 
 
-def unchanged_anchors(site: Site, survey: Survey) -> tuple[int, ...]:
-    """Anchors of the site that the survey has not determined."""
-    return tuple(anchor.id for anchor in site.all_anchors if anchor.id not in survey.determined)
-
-
 def delay_changes_ticks(site: Site, survey: Survey) -> dict[int, int]:
     """Changes of the TX antenna delays of the site's determined anchors.
 

@@ -19,7 +19,7 @@ from scipy.special import chdtri
 from skyless.core.arrays import Array, Integers, Mask, Vector
 from skyless.site.survey.facts import TagReceived
 from skyless.site.survey.fit import LATE_CUTOFF
-from skyless.site.survey.legs import STD_OVER_MAD
+from skyless.site.survey.legs import STD_OVER_MAD, group_medians
 from skyless.site.survey.problem import Problem, Solution, distances_m, solve_least_squares, unknown_columns
 
 # Differences, averaged over epochs of half a second
@@ -99,9 +99,9 @@ class EpochCollector:
         middle_s = t_s.min(initial=np.inf) + (numbers + 0.5) * EPOCH_S if len(t_s) else t_s
         n = max(len(anchors), 1)
         group, group_of = np.unique((epoch * n + first) * n + second, return_inverse=True)
-        median = _group_medians(group_of, value_m, len(group))
+        median = group_medians(group_of, value_m, len(group))
         away = np.abs(value_m - median[group_of])
-        scale = np.maximum(STD_OVER_MAD * _group_medians(group_of, away, len(group)), 0.02)
+        scale = np.maximum(STD_OVER_MAD * group_medians(group_of, away, len(group)), 0.02)
         kept = away <= _REJECT * scale[group_of]
         group_of, value_m, since_s = group_of[kept], value_m[kept], (t_s - middle_s[epoch])[kept]
         count = np.bincount(group_of, minlength=len(group))
@@ -118,14 +118,6 @@ class EpochCollector:
             count,
             np.full((len(middle_s), 3), np.nan),
         )
-
-
-def _group_medians(group_of: Integers, values: Vector, groups: int) -> Vector:
-    """Lower median of each group, shape (groups,); every group has a value."""
-    order = np.lexsort((values, group_of))
-    size = np.bincount(group_of, minlength=groups)
-    begin = np.cumsum(size) - size
-    return np.asarray(values[order][begin + (size - 1) // 2] if groups else values)
 
 
 def tag_ranges(epochs: TagEpochs, pair_ranges_m: Mapping[tuple[int, int], float]) -> Array:

@@ -3,7 +3,7 @@
 import math
 import warnings
 from collections import Counter, deque
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from typing import Final, Literal
 
 import numpy as np
@@ -27,6 +27,7 @@ from skyless.site.survey.explain import (
 from skyless.site.survey.facts import Facts, PairBlock, PairRange, PairRanges, Survey
 from skyless.site.survey.legs import MEDIAN_VARIANCE, STD_OVER_MAD
 from skyless.site.survey.pair_ranger import PairRanger, StepTable
+from skyless.site.survey.solve import run_survey
 
 _USUAL_WINDOWS: Final = 60  # windows in the median that is the usual range
 _DRIFT_WINDOWS: Final = 360
@@ -199,8 +200,7 @@ class AnchorWatch:
         self._dimensions = dimensions
         self._history = RangeHistory()
         self._row: dict[tuple[int, int], int] = {}
-        self._first: list[int] = []
-        self._second: list[int] = []
+        """Row of each pair in the history, in the order of rows."""
         self._silent: list[int] = []
         """Windows without a range since each pair's last one, while both anchors had others."""
         self._pending: dict[int, dict[int, list[PairBlock]]] = {}
@@ -233,7 +233,7 @@ class AnchorWatch:
         held = sorted((one.finding for one in self._held), key=lambda one: (one.kind == "check", -abs(one.size_m)))
         silent = []
         for row, since_s in sorted(self._blocked.items()):
-            a, b = self._ids[self._first[row]], self._ids[self._second[row]]
+            a, b = list(self._row)[row]
             sentence = f"anchors {a} and {b} no longer receive each other"
             silent.append(Finding("link", (a, b), 0.0, None, since_s, sentence))
         return (*held, *silent)
@@ -285,15 +285,19 @@ class AnchorWatch:
         self._windows.clear()
         self._blocked.clear()
 
-    def _ends(self) -> list[tuple[int, int]]:
-        return list(zip(self._first, self._second, strict=True))
+    def _ends(self, rows: Integers) -> tuple[Integers, Integers]:
+        """Numbers of both anchors of these rows' pairs."""
+        numbers = np.array([(self._number[a], self._number[b]) for a, b in self._row], np.int64).reshape(-1, 2)[rows]
+        return numbers[:, 0], numbers[:, 1]
+
+    def _anchors_of(self, rows: Integers) -> set[int]:
+        pairs = list(self._row)
+        return {anchor for row in rows.tolist() for anchor in pairs[row]}
 
     def _pair_row(self, a: int, b: int, given_m: float | None = None) -> int:
         row = self._row.get((a, b))
         if row is None:
             row = self._row[a, b] = self._history.add_pair(given_m)
-            self._first.append(self._number[a])
-            self._second.append(self._number[b])
             self._silent.append(0)
         return row
 
@@ -316,7 +320,7 @@ class AnchorWatch:
             parts += [part for part in map(self._named, slow) if not covered & set(part.anchors)]
             is_touched |= self._touched(map(self._named, seen.parts))
             self._windows.append(_Window(start_s, tuple(parts)))
-            self._update(known, seen, {self._ids[end] for row in known.tolist() for end in self._ends()[row]})
+            self._update(known, seen, self._anchors_of(known))
         is_expected = self._note_silence(is_present, start_s)
         is_displaced = self._touched(one.finding for one in self._held if one.finding.kind != "link")
         self._history.add_window(range_m, ~is_touched, ~is_displaced, is_expected)
@@ -357,8 +361,7 @@ class AnchorWatch:
         return explain(pairs, change_m[is_old]).parts
 
     def _pairs(self, rows: Integers, white_m: Array, drift_m: Array) -> Pairs:
-        first, second = np.array(self._first)[rows], np.array(self._second)[rows]
-        return pairs_of(self._position_m, first, second, self._dimensions, white_m, drift_m)
+        return pairs_of(self._position_m, *self._ends(rows), self._dimensions, white_m, drift_m)
 
     def _named(self, part: Part) -> Part:
         return replace(part, anchors=tuple(self._ids[number] for number in part.anchors))
@@ -431,7 +434,7 @@ class AnchorWatch:
 
     def _lasts(self, finding: Finding, known: Integers, seen: Explanation) -> bool:
         """Whether the changes that remain unexplained are still evidence for a finding."""
-        first, second = np.array(self._first)[known], np.array(self._second)[known]
+        first, second = self._ends(known)
         pairs = Pairs(self._position_m, first, second, self._dimensions, seen.weight)
         found, dof = evidence(pairs, seen.weight, seen.weighted_m)
         n = len(self._ids)
@@ -449,9 +452,9 @@ class AnchorWatch:
 
     def _note_silence(self, is_present: Mask, start_s: float) -> Mask:
         """Find links that are silent although others receive both anchors. Returns pairs with an expected range."""
-        heard = {end for row in np.flatnonzero(is_present).tolist() for end in self._ends()[row]}
+        heard = self._anchors_of(np.flatnonzero(is_present))
         expected = np.zeros(len(is_present), np.bool_)
-        for row, (a, b) in enumerate(self._ends()):
+        for row, (a, b) in enumerate(self._row):
             if is_present[row]:
                 self._silent[row] = 0
                 self._blocked.pop(row, None)
@@ -483,8 +486,6 @@ _FALSE_MOVE: Final = 1e-3
 _MIN_PAIRS: Final = 2  # pairs of one anchor whose ranges must differ
 _DRIFT_FLOOR_M: Final = 0.02  # ranges in rooms wander by this much, and more slowly than one step
 
-Solve = Callable[[PairRanges, Facts], Survey]
-
 
 class Change(Struct, frozen=True):
     """A change at the anchors while ranges were gathered."""
@@ -494,7 +495,7 @@ class Change(Struct, frozen=True):
     """Time from which on ranges agree."""
 
 
-def change_of(table: StepTable, facts: Facts, solve: Solve) -> Change | None:
+def change_of(table: StepTable, facts: Facts) -> Change | None:
     """The largest change of an anchor between earlier and later ranges; None if there is none."""
     steps = len(table.start_s)
     if steps < _MIN_STEPS:
@@ -509,7 +510,7 @@ def change_of(table: StepTable, facts: Facts, solve: Solve) -> Change | None:
     if not is_changed.any():
         return None
     split = int(np.argmin(np.where(is_changed, left_m, np.inf)))
-    part = _explained(table, before_m[split], after_m[split], white_m2, drift_m2, facts, solve)
+    part = _explained(table, before_m[split], after_m[split], white_m2, drift_m2, facts)
     if part is None:
         return None
     # The anchor may still be moving in the first step after the split, so this is left out if there is another one.
@@ -517,10 +518,10 @@ def change_of(table: StepTable, facts: Facts, solve: Solve) -> Change | None:
     return Change(sentence_of(part.kind, part.anchors, part.size_m, or_else=part.or_else), since_s)
 
 
-def drop_moved(ranger: PairRanger, facts: Facts, solve: Solve) -> tuple[Change, ...]:
+def drop_moved(ranger: PairRanger, facts: Facts) -> tuple[Change, ...]:
     """Drop the ranges from before each change until the rest agree. Returns the changes."""
     found: list[Change] = []
-    while (change := change_of(ranger.steps.table(), facts, solve)) is not None:
+    while (change := change_of(ranger.steps.table(), facts)) is not None:
         ranger.drop_before(change.since_s)
         found.append(change)
     return tuple(found)
@@ -557,7 +558,7 @@ def _scatter(table: StepTable) -> tuple[Array, Array]:
 
 
 def _explained(
-    table: StepTable, before_m: Array, after_m: Array, white_m2: Array, drift_m2: Array, facts: Facts, solve: Solve
+    table: StepTable, before_m: Array, after_m: Array, white_m2: Array, drift_m2: Array, facts: Facts
 ) -> Part | None:
     """The largest change, with identifiers of anchors; None if only links were late."""
     in_both = np.flatnonzero(np.isfinite(after_m - before_m))
@@ -568,7 +569,7 @@ def _explained(
         for (a, b), range_m, std_m in zip(pairs, before_m[in_both].tolist(), stds_m.tolist(), strict=True)
     )
     everybody = tuple(sorted({anchor for pair in pairs for anchor in pair}))
-    found = solve(PairRanges(ranges, everybody), replace(facts, tags=()))
+    found = run_survey(PairRanges(ranges, everybody), replace(facts, tags=()))
     placed = {one.id: (one.x_m, one.y_m, one.z_m) for one in found.anchors if one.determined}
     ids = sorted(placed)
     rows = np.array([row for row, (a, b) in zip(in_both.tolist(), pairs, strict=True) if {a, b} <= placed.keys()])
