@@ -138,14 +138,14 @@ def dropped(drops: Mapping[str, int]) -> str:
     return f"dropped: {', '.join(f'{count} × {name}' for name, count in most)}"
 
 
-def number(value: float | None, form: str = "{:.3f}", scale: float = 1.0) -> str:
+def number(value: float | None, form: str = "{:z.3f}", scale: float = 1.0) -> str:
     """Format a number for people; a dash for None."""
     return "–" if value is None else form.format(scale * value)
 
 
 def cm(value_m: float | None) -> str:
     """Format a length in centimetres for people; a dash for None."""
-    return number(value_m, "{:.2f} cm", 100.0)
+    return number(value_m, "{:z.2f} cm", 100.0)
 
 
 def plain(text: str, keep: str = "") -> str:
