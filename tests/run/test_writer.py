@@ -194,6 +194,14 @@ def test_a_journal_of_an_older_version_is_not_passed_over(tmp_path):
         Writer(tmp_path, 1)
 
 
+def test_of_a_disk_that_becomes_full_meanwhile_the_error_says_so(tmp_path):
+    (tmp_path / "fixes.parquet.tmp").symlink_to("/dev/full")
+    with pytest.raises(OSError, match="No space left on device") as caught:
+        write_table(fix_columns(records([1])), FIX_COLUMNS, tmp_path / "fixes.parquet")
+    assert caught.value.errno == errno.ENOSPC
+    assert not list(tmp_path.iterdir())
+
+
 def test_too_many_tags_are_counted(tmp_path, monkeypatch):
     monkeypatch.setattr(writer_module, "LIMITS", HistoryLimits(tags=2))
     writer = Writer(tmp_path, 1)

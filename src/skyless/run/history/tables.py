@@ -6,6 +6,7 @@ In memory a table is its columns by name. Times are whole milliseconds since 197
 import contextlib
 import errno
 import os
+import re
 import secrets
 import tempfile
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -124,8 +125,12 @@ def _reading(file: Path, what: str = "") -> Iterator[duckdb.DuckDBPyConnection]:
         with connection() as duck:
             yield duck
     except duckdb.Error as error:
-        reason = str(error).partition("\n")[0]
-        raise SkylessError(f"{file} cannot be read; it should be a Parquet file{what}: {reason}") from None
+        right = f"it should be a Parquet file{what}"
+        raise SkylessError(f"{file} cannot be read; {right}: {_first_line(error)}") from None
+
+
+def _first_line(error: duckdb.Error) -> str:
+    return str(error).partition("\n")[0]
 
 
 def read_columns(file: Path, kinds: Mapping[str, str], wanted: str = "true") -> Columns:
@@ -200,7 +205,9 @@ def write_answer(
         with contextlib.suppress(OSError):
             scratch.unlink()
         if isinstance(error, duckdb.Error):
-            raise OSError(errno.EIO, str(error).partition("\n")[0], str(file)) from None
+            stated = re.search(r'"errno":"(\d+)"', str(error))
+            why = (int(stated[1]), os.strerror(int(stated[1]))) if stated else (errno.EIO, _first_line(error))
+            raise OSError(*why, str(file)) from None
         raise
     _sync(file.parent)  # makes the file's name durable, too
 
