@@ -36,7 +36,7 @@ def said(**fields):
 def test_the_table_has_trouble_first_and_nothing_is_good_that_is_not_heard():
     table = HubSites(None, now_s=0.0)
     for number in (1, 2, 3, 4, 5):
-        table.add_site(topics.site_topic(number), msgspec.json.encode({"site": {"name": f"Hall {number}"}}))
+        table.known.add(topics.site_topic(number), msgspec.json.encode({"site": {"name": f"Hall {number}"}}))
     assert {site.condition for site in table.sites(1.0)} == {"unknown"}
     table.add_summary(1, said(condition="good"), 100.0, 5.0)
     table.add_summary(2, said(condition="degraded", reasons=["anchor 3 is silent", "another"]), 100.0, 5.0)
@@ -66,7 +66,7 @@ async def test_a_site_is_let_go_when_nobody_looks_and_the_next_look_connects_it_
     for one in (HubLink, HubSites):
         monkeypatch.setattr(one, "run", lambda *_: asyncio.sleep(60))
     shown = hub.ShownSites(NatsAddress("nats://none"), "here", lambda: LiveSite("here", "nats://none", at_hub=True))
-    shown.known.add_site(topics.site_topic(NUMBER), msgspec.json.encode({"site": {"name": "Hall"}}))
+    shown.known.known.add(topics.site_topic(NUMBER), msgspec.json.encode({"site": {"name": "Hall"}}))
     async with running(shown.run()):
         live = shown.of(str(NUMBER))
         page = live.open_page()

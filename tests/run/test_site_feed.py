@@ -10,7 +10,7 @@ from skyless.run.mqtt.topics import ROOT
 from skyless.run.site_feed import KINDS, SiteFeed
 from support.site_messages import anchor_health, tag_health
 
-DECODED = [(kind, topic.replace("+", "x")) for kind in KINDS if kind.payload for topic in kind.topics]
+DECODED = [(kind, kind.levels.replace("+", "x")) for kind in KINDS if kind.payload]
 ALARM = AlarmMessage("r/t1/1", "r", "r", "inside", "warning", "t1", 1.0, 1.0, "")
 
 
@@ -33,15 +33,15 @@ def test_what_cannot_be_read_reaches_nobody_and_is_counted_by_kind(payload):
     for _, topic in DECODED:
         heard.say(topic, payload)
     assert heard.got == []
-    assert heard.feed.drops == Counter(kind.name for kind, _ in DECODED)
+    assert heard.feed.drops == Counter(kind.kind for kind, _ in DECODED)
 
 
 def test_a_retained_message_that_is_withdrawn_is_none_and_any_other_is_wrong():
     heard = Heard()
     for _, topic in DECODED:
         heard.say(topic, b"")
-    assert heard.got == [(kind.name, None) for kind, _ in DECODED if kind.retained]
-    assert heard.feed.drops == Counter(kind.name for kind, _ in DECODED if not kind.retained)
+    assert heard.got == [(kind.kind, None) for kind, _ in DECODED if kind.retained]
+    assert heard.feed.drops == Counter(kind.kind for kind, _ in DECODED if not kind.retained)
 
 
 @pytest.mark.parametrize(

@@ -35,7 +35,7 @@ def each_second(begin_s, end_s):
 def test_of_a_new_node_nothing_is_known():
     node = Node("t1")
     assert (node.online, node.host, node.interval_s, node.row, node.fix) == (None, "", None, None, None)
-    assert (node.ended_unix_s, node.fixes, node.serial, node.health_serial, node.status_serial) == (0.0, 0, 0, 0, 0)
+    assert (node.ended_unix_s, node.serial, node.health_serial, node.status_serial) == (0.0, 0, 0, 0)
     table = SiteTable(0.0)
     assert (table.fixes_serial, table.healths_serial, table.statuses_serial, table.is_empty) == (0, 0, 0, True)
 
@@ -77,12 +77,12 @@ def test_of_the_gaps_the_last_eight_are_remembered_for_ten_times_their_length():
     assert (tag.gaps, tag.interval_s) == ([], 0.0)
 
 
-def test_fixes_are_counted_since_the_tag_was_last_gone():
+def test_a_tag_is_there_since_its_first_fix_after_it_was_last_gone():
     table, tag = table_with(*each_second(0, 20))
-    assert (tag.fixes, tag.first_s) == (21, 0.0)
+    assert tag.first_s == 0.0
     table.tick(40.0)
     heard(table, 50.0)
-    assert (tag.fixes, tag.first_s) == (1, 50.0)
+    assert tag.first_s == 50.0
 
 
 def test_an_absence_is_no_rhythm_however_short_the_time_before_and_two_alike_are_one():
@@ -153,7 +153,7 @@ def test_a_sleep_is_no_gap_in_a_tag_s_rhythm():
     table.add_health("tag", "t1", tag_health(sleeps_s=100.0), 20.0)
     assert table.tick(119.0) == []
     heard(table, 121.0)
-    assert (tag.gaps, tag.fixes) == ([], 22)
+    assert (tag.gaps, tag.fix_s) == ([], 121.0)
 
 
 def test_silence_counts_as_long_as_both_feeds_can_bring_something():

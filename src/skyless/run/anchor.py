@@ -150,10 +150,6 @@ class AnchorNode:
         """Process a subscriber's request for stamps."""
         self.stamps.request(message, time.monotonic())
 
-    def refuse(self, reason: str) -> None:
-        """Count an unusable MQTT message."""
-        self.refused[reason] += 1
-
     async def run(self) -> None:
         """Serve until cancelled."""
         try:
@@ -348,8 +344,10 @@ class Anchors:
     def _link(self, node: AnchorNode, address: MqttAddress | None) -> Link | None:
         link = link_of(address, node.id, site=self._site.id, kind="anchor")
         if link is not None:
-            asked = reader(RequestMessage, node.on_request, partial(node.refuse, "bad-request"))
-            placed = reader(PlacementMessage, partial(self._place, node), partial(node.refuse, "bad-placement"))
+            asked = reader(RequestMessage, node.on_request, partial(node.refused.update, ("bad-request",)))
+            placed = reader(
+                PlacementMessage, partial(self._place, node), partial(node.refused.update, ("bad-placement",))
+            )
             link.subscribe(request_topic(self._site.id), asked)
             link.subscribe(placement_topic(self._site.id), placed, qos=1)
         return link

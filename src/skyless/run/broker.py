@@ -32,7 +32,7 @@ from skyless.run.gather.subjects import FIRST_PORT as FIRST_NATS_PORT
 from skyless.run.hub_files import PING_INTERVAL, Leaf
 from skyless.run.mqtt.address import ACCESS, PASSWORD_VARIABLE, MqttAddress, Role, mqtt_address
 from skyless.run.mqtt.connection import check_broker
-from skyless.run.process import data_folder, end, end_with_parent, is_free, locked, reserve, reserve_next
+from skyless.run.process import data_folder, end, end_with_parent, locked, reserve_free, reserve_next
 
 FIRST_PORT: Final = 1883
 _PRIVATE: Final = 10_000
@@ -228,18 +228,12 @@ def _reserved(host: str, port: int) -> socket.socket | None:
 
     Raises SkylessError: the host is not an address of this machine, or the port needs privileges.
     """
-    held = reserve(host, port)
-    if held is None:
-        return None
     try:
-        if is_free(host, port):
-            return held
+        return reserve_free(host, port)
     except PermissionError:
         raise SkylessError(f"--port is {port}, which only the system may use; it should be 1024 or more") from None
     except OSError:
         raise SkylessError(f"--listen is {host!r}; it should be an address of this machine") from None
-    held.close()
-    return None
 
 
 # The process

@@ -18,6 +18,7 @@ from skyless.run.mqtt.address import MqttAddress
 from skyless.run.mqtt.connection import Introduction, Reactions, RefusedError, open_connection, trouble_with
 from skyless.run.mqtt.messages import StatusMessage, WrongMessageError, read_message
 from skyless.run.mqtt.topics import EVERY_NODE, EVERY_SITE, site_topic, status_topic
+from skyless.run.process import outlasting
 
 _KEEPALIVE_S: Final = 10
 _RETRY_S: Final = 0.5
@@ -104,15 +105,11 @@ async def find_site(address: MqttAddress) -> int:
                 logged = words
                 _log.warning("%s; waiting for a site", words)
 
-    watching = asyncio.create_task(watch_sites(address, on_sites))
-    try:
-        await asyncio.wait((found, watching), return_when=asyncio.FIRST_COMPLETED)
-        if watching.done():
-            watching.result()
-        alive = found.result()
-    finally:
-        watching.cancel()
-        await asyncio.gather(watching, return_exceptions=True)
+    async def first() -> None:
+        await found
+
+    await outlasting(watch_sites(address, on_sites), first())
+    alive = found.result()
     if len(alive) > 1:
         named = "; ".join(
             f"number {site.number}, {site.name!r}, {site.online} program{'s' if site.online > 1 else ''} online"

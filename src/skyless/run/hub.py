@@ -15,6 +15,7 @@ from msgspec import Struct
 from nats.errors import Error
 from nats.js.api import ExternalStream, StreamConfig, StreamSource
 from nats.js.errors import NotFoundError
+from paho.mqtt.client import topic_matches_sub
 
 from skyless.core.errors import SkylessError
 from skyless.run.broker import Broker
@@ -93,12 +94,7 @@ class HubLink:
 
     def _is_live(self, topic_filter: str) -> bool:
         """Whether a filter's messages come only live, because no stream has them."""
-        levels = subjects.subject_of(topic_filter).split(".")
-        for subject in _KEPT:
-            kept = subjects.at(subject, self.site).split(".")
-            if len(kept) == len(levels) and all(one in ("*", level) for one, level in zip(kept, levels, strict=True)):
-                return False
-        return True
+        return not any(topic_matches_sub(subjects.filter_of(kept, self.site), topic_filter) for kept in _KEPT)
 
     async def _follow(self, client: "Client", pattern: str) -> None:
         name, own = subjects.at(pattern, self.site), f"skyless.v1.{self.site}.>"
@@ -297,7 +293,8 @@ class HubSites:
     def __init__(self, address: NatsAddress, now_s: float) -> None:
         self.address = address
         self._began_s = now_s
-        self._known = KnownSites()
+        self.known = KnownSites()
+        """What the sites have said about themselves."""
         self._heard: dict[int, tuple[float, float, Summary]] = {}
         """Newest summary of each site, and when it arrived, by the monotonic and the Unix clock."""
         self._client: Client | None = None
@@ -312,10 +309,6 @@ class HubSites:
         """Whether the hub has ever been connected."""
         return self._client is not None
 
-    def add_site(self, topic: str, payload: bytes) -> None:
-        """Process a site's message about itself."""
-        self._known.add(topic, payload)
-
     def add_summary(self, number: int, payload: bytes, now_s: float, unix_s: float) -> None:
         """Process a summary of a site's gather. Unreadable ones are ignored."""
         with contextlib.suppress(msgspec.MsgspecError):
@@ -324,7 +317,7 @@ class HubSites:
     def names(self) -> dict[int, str]:
         """Return the sites' names by number."""
         heard = {number: summary.site for number, (_, _, summary) in self._heard.items()}
-        known = {site.number: site.name for site in self._known.sites()}
+        known = {site.number: site.name for site in self.known.sites()}
         return heard | known | {number: name for number, name in heard.items() if name}
 
     def sites(self, now_s: float) -> list[HubSite]:
@@ -367,7 +360,7 @@ class HubSites:
                         with contextlib.suppress(NotFoundError):  # the message has not reached the hub yet
                             name = subjects.at(subjects.STATE_STREAM, number)
                             found = await client.jetstream().get_last_msg(name, subject, direct=True)
-                            self.add_site(subjects.topic_of(subject), found.data or b"")
+                            self.known.add(subjects.topic_of(subject), found.data or b"")
                 except Error as error:
                     say(f"the sites at the hub cannot be listed: {error or type(error).__name__}")
                 await asyncio.sleep(LIST_S)

@@ -319,16 +319,21 @@ def reserve(host: str, port: int) -> socket.socket | None:
     return held
 
 
+def reserve_free(host: str, port: int) -> socket.socket | None:
+    """Reserve a port that is free; None if any program has it. Raises OSError as ``is_free`` does."""
+    held = reserve(host, port)
+    if held is None or is_free(host, port):
+        return held
+    held.close()
+    return None
+
+
 def reserve_next(host: str, first: int) -> tuple[int, socket.socket]:
     """Return the first free, unreserved port from ``first`` on, and the socket that reserves it."""
     port = first
-    while True:
-        held = reserve(host, port)
-        if held is not None:
-            if is_free(host, port):
-                return port, held
-            held.close()
+    while (held := reserve_free(host, port)) is None:
         port += 1
+    return port, held
 
 
 def hold_any(host: str) -> tuple[int, socket.socket]:

@@ -12,60 +12,29 @@ from collections.abc import Callable, Iterable
 from functools import lru_cache
 from typing import Any, Final, Generic, Protocol, TypeVar
 
-import msgspec
 from msgspec import Struct
 
 from skyless.core.errors import ConfigurationError
 from skyless.run.assets import read_assets
-from skyless.run.mqtt import messages
+from skyless.run.mqtt import messages, topics
 from skyless.run.mqtt.link import Handler
-from skyless.run.mqtt.messages import WrongMessageError
-from skyless.run.mqtt.topics import ROOT
+from skyless.run.mqtt.messages import WrongMessageError, read_message
+from skyless.run.mqtt.topics import ROOT, Topic
 from skyless.run.zones import read_zones
 
 _log = logging.getLogger("skyless.run")
 
 
-class Kind(Struct, frozen=True):
-    """A kind of message of a site."""
-
-    name: str
-    topics: tuple[str, ...]
-    """Topics below the site's, with + for a name."""
-    payload: type[Struct] | None = None
-    """What it is; None for an image."""
-    retained: bool = False
-    """Whether the broker keeps it, so that a reader gets it at once, and perhaps again."""
-    once: bool = False
-    """Whether it is sent only once, so that it is asked for with QoS 1."""
-    own_name: Callable[[Any], str] | None = None
-    """The name that the message itself states, which should be the topic's."""
-
-
 KINDS: Final = (
-    Kind("site", ("site",), messages.SiteMessage, retained=True),
-    Kind("floor_plan", ("floor_plan", "floor_plan/+"), retained=True),
-    Kind("zones", ("zones",), messages.ZonesMessage, retained=True, once=True),
-    Kind("assets", ("assets",), messages.AssetsMessage, retained=True, once=True),
-    Kind("alarm_rules", ("alarm_rules",), messages.AlarmRulesMessage, retained=True, once=True),
-    Kind("survey", ("survey/state",), messages.SurveyMessage, retained=True, once=True),
-    Kind("watch", ("survey/watch",), messages.WatchMessage, retained=True, once=True),
-    Kind("status", ("+/+/status",), messages.StatusMessage, retained=True, own_name=lambda one: str(one.name)),
-    Kind("fix", ("tag/+/fix",), messages.FixMessage, own_name=lambda one: str(one.tag)),
-    Kind("health", ("tag/+/health",), messages.TagHealth, own_name=lambda one: str(one.tag)),
-    Kind("health", ("anchor/+/health",), messages.AnchorHealth, own_name=lambda one: str(one.anchor)),
-    Kind("health", ("ether/+/health",), messages.EtherHealth),
-    Kind("truth", ("truth",), messages.TruthMessage),
-    Kind("request", ("request",), messages.RequestMessage),
-    Kind("receptions", ("tag/+/receptions",), messages.ReceptionsMessage),
-    Kind("stamps", ("anchor/+/stamps",), messages.StampsMessage),
-    Kind("event", ("zone/+/event",), messages.ZoneEvent, once=True, own_name=lambda one: str(one.zone)),
-    Kind(
-        "alarm", ("alarm/+/+/state",), messages.AlarmMessage,
-        retained=True, once=True, own_name=lambda one: f"{one.rule}/{one.subject}",
-    ),
-    Kind("acknowledge", ("alarm/+/+/acknowledge",), messages.AcknowledgeMessage, once=True),
-)  # fmt: skip
+    *(topics.site_topic, topics.floor_plan_topic, topics.plan_of_floor_topic, topics.zones_topic),
+    *(topics.assets_topic, topics.alarm_rules_topic, topics.survey_topic, topics.watch_topic),
+    *(topics.status_topic, topics.fix_topic),
+    Topic("tag/+/health", messages.TagHealth, "health", own_name=lambda one: str(one.tag)),
+    Topic("anchor/+/health", messages.AnchorHealth, "health", own_name=lambda one: str(one.anchor)),
+    Topic("ether/+/health", messages.EtherHealth, "health"),
+    *(topics.truth_topic, topics.request_topic, topics.receptions_topic, topics.stamps_topic),
+    *(topics.zone_event_topic, topics.alarm_topic, topics.acknowledge_topic),
+)
 """All messages that a site's programs send for its readers (``docs/mqtt.md``)."""
 
 _CHECKED: Final[dict[type, Callable[[bytes], Struct]]] = {
@@ -79,21 +48,24 @@ class Channel(Struct, frozen=True):
     """The meaning of a topic."""
 
     site: str
-    kind: str
-    """Name of the ``Kind``."""
-    name: str = ""
+    of: Topic
+    """One of ``KINDS``."""
+    name: str
     """Name of the tag, anchor, zone or floor; rule and subject of an alarm."""
-    payload: type[Struct] | None = None
-    who: str = ""
+    who: str
     """Kind of the node whose status or health it is."""
-    of: Kind | None = None
+
+    @property
+    def kind(self) -> str:
+        """What readers call messages of this kind."""
+        return self.of.kind
 
 
 def _place(levels: list[str]) -> tuple[int, str, str]:
     return len(levels), levels[0], levels[-1]
 
 
-_KIND_AT: Final = {_place(topic.split("/")): kind for kind in KINDS for topic in kind.topics}
+_KIND_AT: Final = {_place(kind.levels.split("/")): kind for kind in KINDS}
 """No two kinds have topics of the same length that begin and end alike."""
 
 
@@ -111,35 +83,21 @@ def channel_of(topic: str) -> Channel | None:
     )
     if kind is None:
         return None
-    name = "/".join(levels[1:] if kind.name == "floor_plan" else levels[1:-1])
-    return Channel(site, kind.name, name, kind.payload, first if kind.name in ("status", "health") else "", kind)
+    name = "/".join(levels[1:] if kind.kind == "floor_plan" else levels[1:-1])
+    return Channel(site, kind, name, first if kind.kind in ("status", "health") else "")
 
 
 def message_of(channel: Channel, payload: bytes) -> Struct | None:
     """Decode and check a message; None if a retained one was withdrawn. Raises WrongMessageError."""
-    assert channel.payload is not None and channel.of is not None
+    kind, own_name = channel.of.payload, channel.of.own_name
+    assert kind is not None
     if not payload and channel.of.retained:
         return None
-    message, own_name = _decoder_of(channel.payload)(payload), channel.of.own_name
+    read = _CHECKED.get(kind)
+    message = read_message(payload, kind) if read is None else read(payload)
     if own_name is not None and own_name(message) != channel.name:
         raise WrongMessageError(f"it is of {own_name(message)[:40]!r}")
     return message
-
-
-@lru_cache(maxsize=64)
-def _decoder_of(payload: type[Struct]) -> Callable[[bytes], Struct]:
-    """The function that decodes a payload of a type, and raises WrongMessageError."""
-    if payload in _CHECKED:
-        return _CHECKED[payload]
-    decode = msgspec.json.Decoder(payload).decode
-
-    def read(data: bytes) -> Struct:
-        try:
-            return decode(data)
-        except (msgspec.MsgspecError, ValueError, RecursionError) as error:
-            raise WrongMessageError(str(error)) from None
-
-    return read
 
 
 class Source(Protocol):
@@ -187,31 +145,30 @@ class SiteFeed:
     def on_bytes(self, name: str, act: Act) -> None:
         """Call ``act`` with the undecoded messages of a kind: images, and lists whose reader keeps what is wrong."""
         self._raw[name] = act
-        self._subscribe(kind for kind in KINDS if kind.name == name)
+        self._subscribe(kind for kind in KINDS if kind.kind == name)
 
     def attach(self, link: Source, site: int) -> None:
         """Get the messages of a site from a broker or a hub."""
         self._link = link, site
-        self._subscribe(kind for kind in KINDS if kind.payload in self._typed or kind.name in self._raw)
+        self._subscribe(kind for kind in KINDS if kind.payload in self._typed or kind.kind in self._raw)
 
-    def _subscribe(self, kinds: Iterable[Kind]) -> None:
+    def _subscribe(self, kinds: Iterable[Topic]) -> None:
         if self._link is not None:
             link, site = self._link
             for kind in kinds:
-                for topic in kind.topics:
-                    link.subscribe(f"{ROOT}/{site}/{topic}", self.receive, int(kind.once))
+                link.subscribe(f"{ROOT}/{site}/{kind.levels}", self.receive, int(kind.once))
 
     def receive(self, topic: str, payload: bytes) -> None:
         """Process a message of MQTT."""
         channel = channel_of(topic)
-        if channel is None or channel.of is None:
+        if channel is None:
             return
         try:
             if (raw := self._raw.get(channel.kind)) is not None:
                 raw(payload, channel)
-            elif channel.payload in self._typed:
+            elif channel.of.payload in self._typed:
                 message = message_of(channel, payload)
-                for act in self._typed[channel.payload]:
+                for act in self._typed[channel.of.payload]:
                     act(message, channel)
         except (WrongMessageError, ConfigurationError) as error:
             self.drops[channel.kind] += 1

@@ -89,7 +89,7 @@ class Node:
     """A tag, an anchor, the emulated air or another program of a site."""
 
     __slots__ = (
-        *("asleep_until_s", "codes_s", "ended_unix_s", "first_s", "fix", "fix_s", "fixes", "gaps"),
+        *("asleep_until_s", "codes_s", "ended_unix_s", "first_s", "fix", "fix_s", "gaps"),
         *("health", "health_s", "health_serial", "heard_s", "is_due", "is_gone", "learn_s", "learnt_s"),
         *("name", "previous", "row", "sends", "serial", "since_s", "stated_s", "status", "status_serial", "used_s"),
     )
@@ -106,7 +106,6 @@ class Node:
         self.fix_s = float("-inf")  # arrival of its newest fix, passed on or not
         self.sends = False  # whether messages of its own arrive; otherwise it is known only from batches, or expected
         self.first_s = float("-inf")  # arrival of the first fix since it was last gone
-        self.fixes = 0  # number of fixes since then
         self.is_gone = True  # as of the last ``tick``, fix or status
         self.is_due = False  # whether ``tick`` looks at it some time
         self.heard_s: float | None = None  # arrival of the first fix of all
@@ -161,8 +160,7 @@ class Node:
         elif _SHORT_S < gap_s <= longest_s:
             self.gaps, self.learn_s = [*self.gaps[1 - _MAX_GAPS :], _Gap(now_s, gap_s, self.is_gone)], now_s
         if self.is_gone:
-            self.is_gone, self.first_s, self.fixes = False, now_s, 0
-        self.fixes += 1
+            self.is_gone, self.first_s = False, now_s
         if self.gaps and now_s >= self.learn_s:
             self.learn_s = now_s + _LEARN_S
             self.gaps = [gap for gap in self.gaps if now_s - gap.end_s <= _MEMORY * gap.length_s]

@@ -6,6 +6,7 @@ import secrets
 import time
 from collections import Counter
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Final
 
 from msgspec import Struct
@@ -293,14 +294,12 @@ class Tag:
         self._fix_topic = fix_topic(site, self.node.name)
         self._health_topic = health_topic(site, "tag", self.node.name)
         self._receptions_topic = receptions_topic(site, self.node.name)
-        self.link.subscribe(request_topic(site), reader(RequestMessage, self._on_request, self._on_bad_request))
+        count_wrong = partial(self.reception_log.counters.update, ("bad-request",))
+        self.link.subscribe(request_topic(site), reader(RequestMessage, self._on_request, count_wrong))
         self._link_tasks.append(asyncio.ensure_future(keep(self.link, self._log)))
 
     def _on_request(self, request: RequestMessage) -> None:
         self.reception_log.request(request, time.monotonic())
-
-    def _on_bad_request(self) -> None:
-        self.reception_log.counters["bad-request"] += 1
 
     def publish_receptions(self) -> None:
         """Publish the requested raw receptions that are due."""

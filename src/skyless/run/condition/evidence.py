@@ -7,6 +7,8 @@ from collections import deque
 from pathlib import Path
 from typing import Final
 
+from msgspec import Struct
+
 from skyless.run.mqtt.messages import AnchorHealth, FixMessage, StatusMessage, TagHealth
 from skyless.run.site_table import THRESHOLDS, Health, Node, SiteTable
 
@@ -88,21 +90,18 @@ class Evidence:
 # Ages of fixes
 
 
-class _Tag:
+class _Tag(Struct):
     """Delays of one tag's messages: ``now_s`` of arrival less ``unix_s`` of sending, including the clock difference."""
 
-    __slots__ = ("before_s", "begun_s", "delay_s", "delay_seen_s", "least_s", "unix_s")
-
-    def __init__(self, now_s: float) -> None:
-        self.begin(now_s)
-        self.unix_s = float("-inf")  # of the last fix
-        self.delay_s, self.delay_seen_s = 0.0, float("-inf")
-        """Delay of the last health message, if this computer sent it, and its time of arrival."""
-
-    def begin(self, now_s: float) -> None:
-        """Begin a window, and forget the one before."""
-        self.begun_s = now_s
-        self.least_s = self.before_s = float("inf")  # least delays in the current window, and in the one before
+    begun_s: float
+    least_s: float = float("inf")
+    before_s: float = float("inf")
+    """Least delays in the window that began then, and in the one before."""
+    unix_s: float = float("-inf")
+    """Of the last fix."""
+    delay_s: float = 0.0
+    delay_seen_s: float = float("-inf")
+    """Delay of the last health message, if this computer sent it, and its time of arrival."""
 
 
 class FixAges:
@@ -126,7 +125,7 @@ class FixAges:
         if tag is None:
             tag = self._tags[name] = _Tag(now_s)
         if unix_s < tag.unix_s:
-            tag.begin(now_s)
+            tag.begun_s, tag.least_s, tag.before_s = now_s, float("inf"), float("inf")
         elif now_s - tag.begun_s >= _WINDOW_S:
             tag.begun_s, tag.before_s, tag.least_s = now_s, tag.least_s, float("inf")
         made_s = max(latency_s, 0.0)

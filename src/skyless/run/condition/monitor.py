@@ -341,9 +341,7 @@ def anchor_reasons(evidence: Evidence, now_s: float) -> Iterable[Reason]:
     offline, cut_off, idle = _anchors(evidence, now_s)
     if offline:
         which = f"all {len(names)} anchors are" if len(offline) == len(names) else ""
-        which = (
-            which or f"{listed('anchor', evidence.table.spelled(offline))} of {len(names)} {verb(offline, 'is', 'are')}"
-        )
+        which = which or f"{listed('anchor', spelled(offline))} of {len(names)} {verb(offline, 'is', 'are')}"
         advice = "See whether power and program run there; positions are less accurate without them."
         too_few = len(names) - len(offline) < _MIN_ANCHORS
         yield _of("anchor", "anchors", "bad" if too_few else "warning", f"{which} offline", advice, offline)

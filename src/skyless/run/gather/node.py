@@ -351,7 +351,7 @@ class Gather:
                 await self._on_message(message)
         if self._broker is None:
             return
-        filters = [subjects.topic_of(subjects.at(one, site)).replace("*", "+") for one in subjects.STATE]
+        filters = [subjects.filter_of(one, site) for one in subjects.STATE]
         try:
             kept = await kept_messages(self._broker, filters)
         except (OSError, RefusedError) as error:

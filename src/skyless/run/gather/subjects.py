@@ -17,36 +17,41 @@ from msgspec import Struct
 
 from skyless.core.errors import SkylessError
 from skyless.machine import extra_module
+from skyless.run.mqtt import topics
 from skyless.run.mqtt.address import PASSWORD_VARIABLE, hide_password, tls_context
+from skyless.run.mqtt.topics import ROOT, Topic
 from skyless.run.process import Log
 
 if TYPE_CHECKING:
     from nats.aio.client import Client
 
-JSON_FIXES: Final = "skyless.v1.{}.tag.*.fix"
-STATUSES: Final = "skyless.v1.{}.*.*.status"
-HEALTHS: Final = "skyless.v1.{}.*.*.health"
-SITES: Final = "skyless.v1.{}.site"
+
+def subject_of(topic: str) -> str:
+    """Subject for an MQTT topic, or pattern for a topic filter."""
+    levels = (level.replace(".", "//") for level in topic.split("/"))
+    return ".".join("*" if level == "+" else level for level in levels)
+
+
+def _of(*chosen: Topic) -> tuple[str, ...]:
+    return tuple(subject_of(f"{ROOT}/{{}}/{topic.levels}") for topic in chosen)
+
+
+JSON_FIXES, STATUSES, HEALTHS, SITES = _of(
+    topics.fix_topic, topics.status_topic, topics.health_topic, topics.site_topic
+)
 FIXES: Final = "skyless.v2.{}.fixes.*"
 """Batches; the last level is the sender's host."""
 NAMES: Final = "skyless.v2.{}.names.*"
 """``TagName``; the last level is the tag's number."""
 SUMMARY: Final = "skyless.v2.{}.summary"
 
-STATE: Final = (
-    "skyless.v1.{}.site",
-    "skyless.v1.{}.floor_plan",
-    "skyless.v1.{}.floor_plan.*",
-    "skyless.v1.{}.*.*.status",
-    "skyless.v1.{}.zones",
-    "skyless.v1.{}.assets",
-    "skyless.v1.{}.alarm_rules",
-    "skyless.v1.{}.survey.state",
-    "skyless.v1.{}.survey.placement",
-    "skyless.v1.{}.survey.watch",
+STATE: Final = _of(
+    *(topics.site_topic, topics.floor_plan_topic, topics.plan_of_floor_topic, topics.status_topic),
+    *(topics.zones_topic, topics.assets_topic, topics.alarm_rules_topic),
+    *(topics.survey_topic, topics.placement_topic, topics.watch_topic),
 )
 """Retained MQTT messages, of which only the newest matters."""
-EVENTS: Final = ("skyless.v1.{}.zone.*.event", "skyless.v1.{}.alarm.*.*.state")
+EVENTS: Final = _of(topics.zone_event_topic, topics.alarm_topic)
 """MQTT messages, each of which is an event."""
 
 # Streams of a site at its own server. A hub's have the same names; readers there ask for the site's subjects.
@@ -82,15 +87,14 @@ def tag_in(subject: str) -> str:
     return subject.split(".")[4].replace("//", ".")
 
 
-def subject_of(topic: str) -> str:
-    """Subject for an MQTT topic, or pattern for a topic filter."""
-    levels = (level.replace(".", "//") for level in topic.split("/"))
-    return ".".join("*" if level == "+" else level for level in levels)
-
-
 def topic_of(subject: str) -> str:
     """MQTT topic for a subject."""
     return "/".join(level.replace("//", ".") for level in subject.split("."))
+
+
+def filter_of(pattern: str, site: int) -> str:
+    """MQTT topic filter for a pattern of a site's subjects."""
+    return topic_of(at(pattern, site)).replace("*", "+")
 
 
 def site_in(subject: str) -> int | None:

@@ -386,12 +386,9 @@ class HistoryNode:
             else:
                 self._passing.append((subject, payload))
 
-        def topic_filter(pattern: str) -> str:
-            return subjects.topic_of(subjects.at(pattern, self._writer.site)).replace("*", "+")
-
-        self.link.subscribe(topic_filter(subjects.JSON_FIXES), on_fix)
+        self.link.subscribe(subjects.filter_of(subjects.JSON_FIXES, self._writer.site), on_fix)
         for pattern in _PASSED_ON:
-            self.link.subscribe(topic_filter(pattern), on_other, qos=1)
+            self.link.subscribe(subjects.filter_of(pattern, self._writer.site), on_other, qos=1)
 
     async def _pass_on(self, stream: "JetStreamContext") -> None:
         """Publish messages to the streams, each until a stream has acknowledged it."""

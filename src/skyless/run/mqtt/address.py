@@ -172,12 +172,8 @@ class Access(Struct, frozen=True):
 EVERYTHING: Final = "#"
 
 
-def _status(*kinds: str) -> tuple[str, ...]:
-    return tuple(topics.status_topic(EVERY_SITE, kind, EVERY_NODE) for kind in kinds)
-
-
-def _health(*kinds: str) -> tuple[str, ...]:
-    return tuple(topics.health_topic(EVERY_SITE, kind, EVERY_NODE) for kind in kinds)
+def _of(topic: topics.Topic, *kinds: str) -> tuple[str, ...]:
+    return tuple(topic(EVERY_SITE, kind, EVERY_NODE) for kind in kinds)
 
 
 def _all(*chosen: topics.Topic) -> tuple[str, ...]:
@@ -196,20 +192,24 @@ ACCESS: Final = {
         publish=(
             *_all(topics.site_topic, topics.floor_plan_topic, topics.plan_of_floor_topic),
             *_all(topics.stamps_topic, topics.truth_topic),
-            *_status("anchor", "ether"),
-            *_health("anchor", "ether"),
+            *_of(topics.status_topic, "anchor", "ether"),
+            *_of(topics.health_topic, "anchor", "ether"),
         ),
         # A node reads its own status, to correct a late last will.
-        subscribe=(*_all(topics.request_topic, topics.placement_topic), *_status("anchor", "ether")),
+        subscribe=(*_all(topics.request_topic, topics.placement_topic), *_of(topics.status_topic, "anchor", "ether")),
     ),
     Role.TAGS: Access(
-        publish=(*_all(topics.fix_topic, topics.receptions_topic), *_status("tag"), *_health("tag")),
-        subscribe=(*_all(topics.request_topic), *_status("tag")),
+        publish=(
+            *_all(topics.fix_topic, topics.receptions_topic),
+            *_of(topics.status_topic, "tag"),
+            *_of(topics.health_topic, "tag"),
+        ),
+        subscribe=(*_all(topics.request_topic), *_of(topics.status_topic, "tag")),
     ),
     Role.PAGE: Access(
         publish=(
             *_SHOWN,
-            *_status("dashboard", "recorder", "history", "bridge", "homeassistant", "watch", "doctor"),
+            *_of(topics.status_topic, "dashboard", "recorder", "history", "bridge", "homeassistant", "watch", "doctor"),
             "homeassistant/device/+/config",
             "homeassistant/status",
         ),
@@ -220,7 +220,7 @@ ACCESS: Final = {
             *_SHOWN,
             *_all(topics.survey_topic, topics.survey_facts_topic, topics.survey_save_topic),
             *_all(topics.placement_topic, topics.watch_topic),
-            *_status("dashboard", "survey"),
+            *_of(topics.status_topic, "dashboard", "survey"),
         ),
         subscribe=("skyless/#",),
     ),

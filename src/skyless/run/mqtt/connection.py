@@ -46,13 +46,6 @@ _REFUSALS: Final = {
 _log = logging.getLogger("skyless.run.mqtt")
 
 
-class Will(Struct, frozen=True):
-    """The message that the broker publishes, retained and at QoS 1, if the client vanishes without disconnecting."""
-
-    topic: str
-    payload: bytes
-
-
 class Introduction(Struct, frozen=True):
     """What a client tells the broker about itself."""
 
@@ -62,7 +55,8 @@ class Introduction(Struct, frozen=True):
     """The connection is given up when the broker has been silent for this long."""
     persistent: bool = False
     """Whether the broker keeps subscriptions, and messages of QoS 1, for this identifier."""
-    will: Will | None = None
+    will: tuple[str, bytes] | None = None
+    """Topic and payload that the broker publishes, retained and at QoS 1, if the client vanishes without leaving."""
 
 
 class Reactions(Struct, frozen=True):
@@ -102,7 +96,7 @@ class Connection:
         self._keepalive_s = who.keepalive_s
         self._react = react or Reactions()
         self._loop = asyncio.get_running_loop()
-        self._client = _make_client(address, tls, who, BROKER_ANSWER_S)
+        self._client = _make_client(address, tls, who)
         self._accepted: asyncio.Future[None] = self._loop.create_future()
         self._socket: socket.socket | None = None
         self._timer: asyncio.TimerHandle | None = None
@@ -367,7 +361,7 @@ def trouble_with(address: MqttAddress, error: OSError | RefusedError) -> str:
     return f"the broker {address} cannot be reached: {error.strerror or error}"
 
 
-def _make_client(address: MqttAddress, tls: ssl.SSLContext | None, who: Introduction, timeout_s: float) -> paho.Client:
+def _make_client(address: MqttAddress, tls: ssl.SSLContext | None, who: Introduction) -> paho.Client:
     """Make a paho client that neither limits the messages in flight nor reconnects: a link does both."""
     client = paho.Client(
         CallbackAPIVersion.VERSION2,
@@ -375,11 +369,11 @@ def _make_client(address: MqttAddress, tls: ssl.SSLContext | None, who: Introduc
         clean_session=not who.persistent,
         reconnect_on_failure=False,
     )
-    client.connect_timeout = timeout_s
+    client.connect_timeout = BROKER_ANSWER_S
     client.max_inflight_messages_set(0)
     client.username_pw_set(address.user, address.password)
     if who.will is not None:
-        client.will_set(who.will.topic, who.will.payload, qos=1, retain=True)
+        client.will_set(*who.will, qos=1, retain=True)
     if tls is not None:
         client.tls_set_context(tls)
         client.tls_insecure_set(not tls.check_hostname)  # otherwise paho compares the names itself

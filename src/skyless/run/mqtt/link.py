@@ -9,6 +9,7 @@ import random
 import secrets
 import time
 from collections.abc import Callable
+from functools import lru_cache
 from typing import Final
 
 import msgspec
@@ -24,7 +25,6 @@ from skyless.run.mqtt.connection import (
     Outbox,
     Reactions,
     RefusedError,
-    Will,
     open_connection,
     trouble_with,
 )
@@ -199,7 +199,7 @@ class Link:
         return True
 
     def _introduction(self) -> Introduction:
-        will = Will(self._status_topic, _encode(self._offline))
+        will = self._status_topic, _encode(self._offline)
         return Introduction(self._client, self._keepalive_s, self._persistent, will)
 
     def _up(self, connection: Connection) -> None:
@@ -330,27 +330,25 @@ class Link:
 
 
 class Subscriptions:
-    """The handlers of one link, in a tree of the levels of their filters; matches are cached by topic."""
+    """The handlers of one link, in a tree of the levels of their filters."""
 
     def __init__(self) -> None:
         self.filters: dict[str, int] = {}
         """Topic filters with their QoS."""
         self._handlers = MQTTMatcher()  # type: ignore[no-untyped-call]
-        self._found: dict[str, tuple[Handler, ...]] = {}
+        self._matching = lru_cache(_MAX_TOPICS)(self._match)
 
     def add(self, topic_filter: str, handler: Handler, qos: int) -> None:
         """Set the handler of a filter, replacing any previous one."""
         self.filters[topic_filter], self._handlers[topic_filter] = qos, handler
-        self._found.clear()
+        self._matching.cache_clear()
+
+    def _match(self, topic: str) -> tuple[Handler, ...]:
+        return tuple(self._handlers.iter_match(topic))  # type: ignore[no-untyped-call]
 
     def receive(self, topic: str, payload: bytes) -> None:
         """Call all handlers whose filters match."""
-        handlers = self._found.get(topic)
-        if handlers is None:
-            if len(self._found) >= _MAX_TOPICS:
-                self._found.clear()
-            handlers = self._found[topic] = tuple(self._handlers.iter_match(topic))  # type: ignore[no-untyped-call]
-        for handler in handlers:
+        for handler in self._matching(topic):
             try:
                 handler(topic, payload)
             except Exception:  # noqa: BLE001 - one bad handler must not cost the others the connection

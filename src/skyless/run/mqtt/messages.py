@@ -622,6 +622,13 @@ def read_message(payload: bytes, kind: type[_T]) -> _T:
         raise WrongMessageError(str(error)) from None
 
 
+_AS_IN_THE_FIX: Final = (
+    *("time_s", "std_m", "anchors", "chi2", "dof", "residual_rms_m", "method", "height_known", "hpl_m", "vpl_m"),
+    *("integrity_risk", "verified_until_s", "unverified", "orientation", "heading_std_rad"),
+)
+"""Fields that a message takes from its fix unchanged."""
+
+
 def fix_message(tag: str, serial: int, fix: "Fix", unix_s: float, latency_s: float) -> FixMessage:
     """Make the message of a fix; ``unix_s`` is the time at which its last frame ended."""
     dops = fix.dops
@@ -630,31 +637,17 @@ def fix_message(tag: str, serial: int, fix: "Fix", unix_s: float, latency_s: flo
         tag=tag,
         serial=serial,
         unix_s=unix_s,
-        time_s=fix.time_s,
         position_m=vector(fix.position_m.tolist()),
         covariance_m2=_matrix(fix.covariance_m2.ravel().tolist()),
         velocity_mps=vector(fix.velocity_mps.tolist()) if moving else None,  # type: ignore[union-attr]
         velocity_covariance=_matrix(fix.velocity_covariance.ravel().tolist()) if moving else None,  # type: ignore[union-attr]
-        std_m=fix.std_m,
         gdop=dops.gdop,
         pdop=dops.pdop,
         hdop=dops.hdop,
         vdop=dops.vdop,
-        anchors=fix.anchors,
-        chi2=fix.chi2,
-        dof=fix.dof,
-        residual_rms_m=fix.residual_rms_m,
-        method=fix.method,
-        height_known=fix.height_known,
         latency_s=latency_s,
-        hpl_m=fix.hpl_m,
-        vpl_m=fix.vpl_m,
-        integrity_risk=fix.integrity_risk,
         alert=None if fix.alert is None else fix.alert.value,
-        verified_until_s=fix.verified_until_s,
-        unverified=fix.unverified,
-        orientation=fix.orientation,
-        heading_std_rad=fix.heading_std_rad,
+        **{name: getattr(fix, name) for name in _AS_IN_THE_FIX},
     )
 
 

@@ -121,23 +121,6 @@ class ReceptionLog:
             self.interrupt()
 
 
-def receiver_settings(
-    method: str,
-    site: int | None = None,
-    integrity: IntegrityRequirement = IntegrityRequirement(),  # noqa: B008 - a frozen value
-) -> Settings:
-    """The receiver's arguments as a segment states them."""
-    return {
-        "method": method,
-        "site": site,
-        "z_low_m": None,
-        "z_high_m": None,
-        "integrity_risk": integrity.risk,
-        "alert_limit_m": integrity.alert_limit_m,
-        "height_std_m": integrity.height_std_m,
-    }
-
-
 class _TagSettings(Struct, frozen=True):
     """Settings of a tag's program, with defaults for those that a recording lacks; older ones hold more, of no use."""
 
@@ -148,6 +131,17 @@ class _TagSettings(Struct, frozen=True):
     integrity_risk: float = RISK
     alert_limit_m: float | None = None
     height_std_m: float = 0.0
+
+
+def receiver_settings(
+    method: str,
+    site: int | None = None,
+    integrity: IntegrityRequirement = IntegrityRequirement(),  # noqa: B008 - a frozen value
+) -> Settings:
+    """The receiver's arguments as a segment states them."""
+    risk, limit_m, std_m = integrity.risk, integrity.alert_limit_m, integrity.height_std_m
+    asked = _TagSettings(method, site, integrity_risk=risk, alert_limit_m=limit_m, height_std_m=std_m)
+    return msgspec.structs.asdict(asked)
 
 
 def receiver_of(

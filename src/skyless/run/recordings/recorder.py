@@ -80,16 +80,14 @@ class McapFile:
         self._writer.start(PROFILE, f"skyless {installed_version()}")
         self.flush()
 
-    def add(
-        self, topic: str, schema: tuple[str, bytes], payload: bytes, log_ns: int, publish_ns: int | None = None
-    ) -> None:
+    def add(self, topic: str, schema: tuple[str, bytes], payload: bytes, log_ns: int) -> None:
         """Write a JSON message with a Unix time; times never decrease in the file."""
         if self.ended is not None:
             self.lost += 1
             return
         self._newest_ns = log_ns = max(log_ns, self._newest_ns)
         channel = self._channels.get(topic) or self._new_channel(topic, schema)
-        self._writer.add_message(channel, log_ns, payload, log_ns if publish_ns is None else publish_ns)
+        self._writer.add_message(channel, log_ns, payload, log_ns)
         self._unflushed += 1
         self.messages += 1
 
@@ -198,10 +196,10 @@ class McapRecorder:
             self.drops["too-many-topics"] += 1
             return None
         self._topics.add(topic)
-        if channel.of is not None and channel.of.retained:
+        if channel.of.retained:
             self._last[topic] = payload
         log_ns = round(unix_s * NS)
-        if channel.payload is None:
+        if channel.of.payload is None:
             media_type = "image/png" if payload.startswith(b"\x89PNG") else "image/jpeg"
             self.file.attach(
                 f"{FLOOR_PLAN}/{channel.name}" if channel.name else FLOOR_PLAN, media_type, payload, log_ns
@@ -214,7 +212,7 @@ class McapRecorder:
             return None
         assert message is not None  # empty ones are left out above
         self.kinds[channel.kind] += 1
-        self.file.add(topic, schema_of(channel.payload), payload, log_ns)
+        self.file.add(topic, schema_of(channel.of.payload), payload, log_ns)
         self._add_views(message, unix_s, log_ns)
         return message
 

@@ -381,7 +381,12 @@ class McapRecording:
             topic = self._scan.topics.get(channel_id, "")
             channel = channel_of(topic)
             time_s = log_ns / NS
-            if channel is None or channel.payload is None or channel.kind not in kinds or not from_s <= time_s < to_s:
+            if (
+                channel is None
+                or channel.of.payload is None
+                or channel.kind not in kinds
+                or not from_s <= time_s < to_s
+            ):
                 continue
             try:
                 message = message_of(channel, payload)
