@@ -25,13 +25,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, rule
 
+from skyless.core.air.frame import Reception
 from skyless.core.ticks import difference, wrap
 from skyless.radio.dw1000 import radio as dw1000
 from skyless.radio.serial import link
 from skyless.radio.serial.link import (
     BoardSettings,
     Done,
-    Heard,
     Hello,
     NotDone,
     Status,
@@ -159,7 +159,7 @@ def test_errors_are_counted_and_it_listens_on(stage):
     stage.air.pass_s(1e-3)
     stage.arrive(FRAME)
     stage.turn()
-    assert kinds(stage.reports()) == [Heard]
+    assert kinds(stage.reports()) == [Reception]
 
 
 # When it sends
@@ -237,7 +237,7 @@ def test_a_frame_that_comes_shortly_before_ones_own_is_not_lost(stage):
     stage.pass_us(4000 - LEAD_US - 100)
     stage.arrive(FRAME)
     stage.pass_us(2000)
-    assert kinds(stage.reports()) == [Heard, Done]
+    assert kinds(stage.reports()) == [Reception, Done]
 
 
 def test_a_frame_whose_end_the_chip_never_reports_is_cancelled(stage):
@@ -268,7 +268,7 @@ def test_a_chip_that_was_reset_is_reported_and_can_be_configured_again(stage):
     stage.pass_us(5000)
     stage.arrive(FRAME)
     stage.turn()
-    assert kinds(stage.reports()) == [Heard]
+    assert kinds(stage.reports()) == [Reception]
 
 
 @pytest.mark.parametrize("after_us", [1, 10_000, 14_350, 14_420, 14_600, 14_900])
@@ -315,7 +315,7 @@ def test_a_stuck_interrupt_line_is_reported_and_the_chip_is_polled(stage, stuck)
         stage.arrive(FRAME)
         stage.pass_us(1050)
     assert stage.chip.arrivals["heard"] >= 206  # a measurement may cost two
-    assert kinds(stage.reports()) == [Heard] * stage.chip.arrivals["heard"]
+    assert kinds(stage.reports()) == [Reception] * stage.chip.arrivals["heard"]
     stage.tx_at(3000, SHORT)
     stage.pass_us(5000)
     assert kinds(stage.reports()) == [Done]
@@ -357,7 +357,7 @@ def superframe(stage, slot_us=2100, slots=7, mine=3):
 
 def test_temperature_and_supply_are_measured_in_the_own_slot_where_all_others_send(stage):
     superframe(stage)
-    assert kinds(stage.reports()) == [Heard, Heard, Heard, Done, Heard, Heard, Heard]
+    assert kinds(stage.reports()) == [Reception, Reception, Reception, Done, Reception, Reception, Reception]
     (status,) = stage.ask(ASK_STATUS, turns=1)
     assert status.temperature_c == pytest.approx(31.0, abs=1.2)
     assert status.supply_v == pytest.approx(3.3, abs=0.02)
@@ -430,7 +430,7 @@ def test_a_flood_of_noise_costs_no_reception_and_restarts_the_line():
         stage.turn(5)
     assert stage.board.chip.received == 300
     assert stage.bus.restarts >= 1
-    assert kinds(stage.reports()) == [Heard] * 300
+    assert kinds(stage.reports()) == [Reception] * 300
     stage.bus.to_board[:] = b"\0"
     assert stage.ask(ASK_STATUS, turns=2)[-1].garbled > 100
 
@@ -454,7 +454,7 @@ def test_the_clock_may_wrap():
         stage.pass_us(6000)
         stage.arrive(FRAME)
         stage.turn(2)
-    assert kinds(stage.reports()) == [Done, Heard] * 20
+    assert kinds(stage.reports()) == [Done, Reception] * 20
 
 
 # All of it in any order
@@ -557,7 +557,7 @@ class Fire(RuleBasedStateMachine):
         stage = self.stage
         for one in stage.reports():
             assert not isinstance(one, str), one
-            if isinstance(one, Heard):
+            if isinstance(one, Reception):
                 assert self.arrived.pop(one.frame) == one.rx_ticks
             elif isinstance(one, Done):
                 assert (one.dx_ticks & ~0x1FF) + DELAYS.tx_ticks in (one.tx_ticks, one.tx_ticks + 2**40)
@@ -636,7 +636,7 @@ def test_registers_of_the_chip_are_read_as_often_as_asked_and_one_is_written(sta
     assert stage.chip.misuse == {}
     stage.arrive(FRAME)
     stage.turn(2)
-    assert kinds(stage.reports()) == [Heard]
+    assert kinds(stage.reports()) == [Reception]
 
 
 @pytest.mark.parametrize(

@@ -13,10 +13,11 @@ from msgspec.structs import asdict, replace
 
 from skyless.arguments import OptionError
 from skyless.cli.nodes.boards import FlashOptions
+from skyless.core.air.frame import Reception
 from skyless.core.fix import NoFixReason
 from skyless.radio.dw1000.radio import IDLE, LISTENING
 from skyless.radio.serial import link
-from skyless.radio.serial.link import SETTINGS_BYTES, BoardSettings, Heard, Hello, NotDone, TagConfig, pack, unpack
+from skyless.radio.serial.link import SETTINGS_BYTES, BoardSettings, Hello, NotDone, TagConfig, pack, unpack
 from skyless.radio.tag_reports import BoardStatus
 
 pytestmark = [pytest.mark.site, needs_compiler]
@@ -165,7 +166,7 @@ def test_a_host_that_configures_the_radio_has_a_radio_until_the_next_start():
     stage.pass_us(1000)
     stage.arrive(frame_of(bytes(40)))
     stage.turn(8)
-    assert isinstance(stage.reports()[0], Heard)
+    assert isinstance(stage.reports()[0], Reception)
     assert stage.bus.settings == flash_of(replace(TAG, output=1))
     again, _ = started(stage.bus.settings)
     assert again.ask(link.ASK_TAG_CONFIG) == [TagConfig(replace(TAG, output=1), in_flash=True)]

@@ -79,7 +79,7 @@ def test_a_slow_page_gets_one_state_of_all_that_it_missed(live, wire, times):
 )
 def test_wrong_messages_are_counted_and_change_nothing(live, wire, topic, payload):
     wire.deliver(topic, payload)
-    assert live.dropped.total() == 1
+    assert live.feed.drops.total() == 1
     assert live.table.fixes_serial == 0
     assert live.site is None
     assert live.monitor.zones == ()
@@ -189,7 +189,7 @@ def test_what_the_broker_has_cleared_is_no_fault(live, wire):
     for kind in KINDS:
         if kind.retained:
             wire.deliver(f"{topics.ROOT}/{SITE_ID}/{kind.levels.replace('+', '1')}", b"")
-    assert not live.dropped
+    assert not live.feed.drops
 
 
 def test_the_truth_reaches_the_rows_and_health_the_alarms(live, wire, monkeypatch):

@@ -14,9 +14,10 @@ from skyless.core.site import AccuracySite, AnchorSite, FloorPlanSite, TagsSite
 from skyless.page.overlay_process import MAX_CELLS, grid_of, overlay
 from skyless.page.tasks import KINDS, MovedAnchors, OverlayTask, TaskProcess
 from skyless.sim.lab import lab_site, paper_lab_site
+from skyless.site.channel import ChannelModel
 from skyless.site.planning.colours import COLOUR_STOPS
 from skyless.site.planning.links import HDOP, PDOP, SIGMA
-from skyless.site.planning.maps import PlanSettings, Predictor
+from skyless.site.planning.maps import Predictor
 
 pytestmark = pytest.mark.site
 
@@ -58,7 +59,7 @@ def test_a_large_hall_gets_a_coarser_grid_and_every_grid_is_bounded():
 
 
 def test_values_are_the_planners_row_by_row_from_the_lowest_y():
-    predictor = Predictor(LAB, PlanSettings())
+    predictor = Predictor(LAB, ChannelModel())
     for kind, which, error in (("pdop", PDOP, 1e-3), ("hdop", HDOP, 1e-3), ("sigma", SIGMA, 1e-5)):
         found = overlay(task(kind=kind))
         for column, row in ((0, 0), (5, 0), (2, 7), (3, 3)):

@@ -158,7 +158,7 @@ def test_health_holds_the_newest_of_every_node():
     state.table.add_status(status(), 1.0)
     state.table.add_status(status(online=False), 1.0)
     state.now_s = 3.5
-    state.dropped["fix"] = 3
+    state.table.drops["fix"] = 3
     message = health(state)
     assert [anchor["anchor"] for anchor in message["anchors"]] == [2]
     assert message["ether"]["transmissions"] == 5

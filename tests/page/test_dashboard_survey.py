@@ -201,6 +201,6 @@ def test_a_site_without_positions_has_no_overlay_yet(live, wire):
     schedule = replace(SITE.site.schedule, mode="free")
     site = replace(SITE.site, anchors=(), unplaced=unplaced, schedule=schedule)
     wire.deliver(topics.site_topic(SITE_ID), replace(SITE, site=site))
-    assert live.dropped == {}
+    assert live.feed.drops == {}
     with pytest.raises(SkylessError, match="no anchor of this site has a position yet"):
         overlay(OverlayTask(site, "pdop", 0.25, None))

@@ -12,8 +12,9 @@ from cobs import cobs
 from hypothesis import given
 from hypothesis import strategies as st
 
+from skyless.core.air.frame import Reception
 from skyless.radio.serial import link
-from skyless.radio.serial.link import Heard, Hello, Status, decode
+from skyless.radio.serial.link import Hello, Status, decode
 
 TICKS = st.integers(0, 2**40 - 1)
 SIXTEEN = st.integers(-0x8000, 0x7FFF)
@@ -105,7 +106,7 @@ def test_a_reception_comes_back_with_a_phase_or_without(ticks, levels, phase, fr
     if not frame:
         assert heard == "malformed-record"
         return
-    assert heard == Heard(ticks, link.from_steps(*levels), frame, phase / 2**16)
+    assert heard == Reception(frame, ticks, None, link.from_steps(*levels), phase / 2**16)
     assert link.to_turn(heard.carrier_phase_cycles) == phase
     assert decode(without) == msgspec.structs.replace(heard, carrier_phase_cycles=None)
 

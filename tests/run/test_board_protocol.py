@@ -22,7 +22,6 @@ from skyless.radio.foreign.foreign_radios import SnifferStream
 from skyless.radio.interface import Late, Restarted, Sent
 from skyless.radio.serial import link
 from skyless.radio.serial.link import BoardSettings, Done, Hello, NotDone, Status, TagConfig, TooLate, decode
-from skyless.radio.serial.link import Heard as HeardFrame
 from skyless.radio.tag_reports import BoardReceiver
 from skyless.run.board import LinkProtocol, SnifferProtocol
 from skyless.sim.impairments import lab_impairments
@@ -227,4 +226,4 @@ def test_a_tag_on_a_board_makes_the_receiver_s_fixes_and_says_where_its_anchors_
     host.said.clear()
     host.board.tag.each_second()
     host.board.on_radio_event(heard[0])
-    assert [type(said) for said in host.said] == [HeardFrame]
+    assert [type(said) for said in host.said] == [Reception]

@@ -13,7 +13,7 @@ from skyless.research.uncertainty import BoundSettings, tracking_bound
 from skyless.sim.lab import lab_site, paper_lab_site
 from skyless.site.channel import ChannelModel
 from skyless.site.planning import links
-from skyless.site.planning.maps import PlanSettings, Predictor
+from skyless.site.planning.maps import Predictor
 from skyless.site.planning.superframe import stamp_variances
 
 pytestmark = pytest.mark.statistical
@@ -25,7 +25,7 @@ QA = 0.3
 
 
 def superframe_and_relays(site, channel=None):
-    predictor = Predictor(site, PlanSettings(channel=channel or ChannelModel()))
+    predictor = Predictor(site, channel or ChannelModel())
     return predictor.superframe, predictor.relays
 
 
@@ -56,7 +56,7 @@ def test_the_filter_claims_the_bound_of_what_has_come_in(site, point):
     for first in range(len(anchors)):
         order = np.roll(anchors, -first, axis=0)
         turns.append(np.trace(tracking_bound(order, path, settings)[-1]))
-    row = Predictor(site, PlanSettings()).at(np.array([point]))[0]
+    row = Predictor(site, ChannelModel()).at(np.array([point]))[0]
     assert row[links.CLAIMED] == pytest.approx(np.sqrt(np.mean(turns)), rel=0.006)
 
 
@@ -131,7 +131,7 @@ def dense(site, point, superframes, shift_m=0.0):
     ids=("lab", "3-D", "range errors"),
 )
 def test_the_true_error_is_that_of_a_dense_recursion(site, point, motion):
-    row = Predictor(site, PlanSettings()).at(np.array([point]))[0]
+    row = Predictor(site, ChannelModel()).at(np.array([point]))[0]
     said, true, _ = dense(site, np.array(point), 100)
     assert row[links.CLAIMED] == pytest.approx(said, rel=4e-3)
     assert row[links.SIGMA] == pytest.approx(true, rel=4e-3)
@@ -147,7 +147,7 @@ def test_range_errors_add_to_the_noise():
     )
     point = np.array([[1.2, 1.6, 0.0]])
     exact, one, two = (
-        Predictor(lab_site(accuracy=accuracy), PlanSettings()).at(point)[0, links.SIGMA] ** 2
+        Predictor(lab_site(accuracy=accuracy), ChannelModel()).at(point)[0, links.SIGMA] ** 2
         for accuracy in (EXACT, base, twice)
     )
     assert (two - exact) / (one - exact) == pytest.approx(4.0, rel=0.1)
@@ -160,7 +160,7 @@ def test_a_late_anchor_shifts_positions_as_in_a_dense_recursion():
     site = replace(LAB, walls=(wall,))
     _, relays = superframe_and_relays(site)
     assert (relays.delay_m == 0.0).all()
-    row = Predictor(site, PlanSettings()).at(np.array([point]))[0]
+    row = Predictor(site, ChannelModel()).at(np.array([point]))[0]
     expected = dense(LAB, np.array(point), 150, 0.05)[2]
     assert row[links.BIAS] == pytest.approx(expected, rel=0.01)
     assert row[links.RMSE] ** 2 == pytest.approx(row[links.SIGMA] ** 2 + row[links.BIAS] ** 2)
@@ -204,10 +204,7 @@ def test_silent_anchors_relay_nothing_and_are_not_relayed():
 
 def test_lost_packets_cost_and_fixes_come_with_those_that_arrive():
     point = np.array([[3.0, 4.0, 0.0]])
-    rows = [
-        Predictor(LAB, PlanSettings(channel=ChannelModel(loss_probability=lost))).at(point)[0]
-        for lost in (0.0, 0.2, 0.5)
-    ]
+    rows = [Predictor(LAB, ChannelModel(loss_probability=lost)).at(point)[0] for lost in (0.0, 0.2, 0.5)]
     assert [row[links.FIX_SHARE] for row in rows] == pytest.approx([1.0, 0.8, 0.5], abs=1e-5)
     assert rows[0][links.SIGMA] < rows[1][links.SIGMA] < rows[2][links.SIGMA]
     # anchors lose half as well here: more than the 1.39 of tags alone (docs/maths.md section 7)
@@ -218,7 +215,7 @@ def test_fixes_count_among_the_messages_of_the_anchors_in_use():
     """Of a corridor's twelve anchors the tag uses eight; of the last two of these half of the messages arrive."""
     anchors = tuple(AnchorSite(k + 1, 6.0 * (k // 2), 3.0 * (k % 2)) for k in range(12))
     site = Site("corridor", 1, 5, anchors, tags=TagsSite(0.0))
-    predictor = Predictor(site, PlanSettings(channel=links.with_range(ChannelModel(), 17.0)))
+    predictor = Predictor(site, links.with_range(ChannelModel(), 17.0))
     point = np.array([[1.0, 1.5, 0.0]])
     (share,), _ = predictor.scene.heard_at(point)
     assert predictor.messages_at(point).tolist() == [8]

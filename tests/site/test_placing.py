@@ -13,13 +13,13 @@ from skyless.site.channel import ChannelModel, barriers_of
 from skyless.site.file.template import rectangular_site
 from skyless.site.planning import links, optimise
 from skyless.site.planning import optimise as optimiser
-from skyless.site.planning.maps import PlanSettings, Predictor, grid_of, plan_map, summary_of
+from skyless.site.planning.maps import Predictor, grid_of, plan_map, summary_of
 from skyless.site.planning.report import plan_warnings
 
 pytestmark = pytest.mark.statistical
 
 FILE = Path("site.toml")
-SETTINGS = PlanSettings()
+CHANNEL = ChannelModel()
 
 
 def with_master(*room):
@@ -34,10 +34,10 @@ def small_search(monkeypatch):
         monkeypatch.setattr(optimise, name, value)
 
 
-def searched(site, outline, anchors, heights, tag_heights, settings=SETTINGS, seed=1):
+def searched(site, outline, anchors, heights, tag_heights, channel=CHANNEL, seed=1):
     floor = links.floor_of(site, FILE, outline, None)
     mounts = links.Mounts(links.sides(floor.outline_m), heights)
-    return floor, optimiser.Search(site, settings, floor, mounts, tag_heights, anchors, seed, 300.0).run()
+    return floor, optimiser.Search(site, channel, floor, mounts, tag_heights, anchors, seed, 300.0).run()
 
 
 @pytest.mark.usefixtures("small_search")
@@ -63,7 +63,7 @@ def test_the_optimiser_beats_the_even_layout(site, outline, anchors, heights, ta
     assert found.finished
     assert len(found.best.site.anchors) == anchors
     grid = grid_of(floor, tag_heights, 0.25)
-    best, even = (summary_of(plan_map(Predictor(s.site, SETTINGS), grid)) for s in (found.best, found.even))
+    best, even = (summary_of(plan_map(Predictor(s.site, CHANNEL), grid)) for s in (found.best, found.even))
     assert best.covered_share == 1.0
     assert best.mean_sigma_m < even.mean_sigma_m
     assert best.worst_sigma_m < even.worst_sigma_m
@@ -95,7 +95,7 @@ def slow_search(monkeypatch):
     site = with_master(10.0, 6.0, 4, 3.0, 1.2)
     floor = links.floor_of(site, FILE, None, None)
     mounts = links.Mounts(links.sides(floor.outline_m), (2.5,))
-    return lambda seconds: SlowSearch(site, SETTINGS, floor, mounts, (1.2,), 4, 1, seconds)
+    return lambda seconds: SlowSearch(site, CHANNEL, floor, mounts, (1.2,), 4, 1, seconds)
 
 
 @pytest.mark.parametrize("seconds", [20.0, 60.0, 200.0])
@@ -153,7 +153,7 @@ def test_one_more_anchor_helps_where_one_is_missing():
     anchors = tuple(a for a in paper_lab_site().anchors if a.id not in {3, 4})
     site = replace(paper_lab_site(), anchors=anchors)
     floor = links.floor_of(site, FILE, np.array([(0, 0), (6, 0), (6, 8), (0, 8)], float), None)
-    more = optimiser.one_more(site, SETTINGS, floor, links.Mounts(links.sides(floor.outline_m), (0.0,)), (0.0,))
+    more = optimiser.one_more(site, CHANNEL, floor, links.Mounts(links.sides(floor.outline_m), (0.0,)), (0.0,))
     assert more.position_m[0] == pytest.approx(6.0, abs=0.5)
     assert more.position_m[1] > 6.0
     assert more.mean_after_m < 0.9 * more.mean_before_m
@@ -169,7 +169,7 @@ def test_one_more_anchor_helps_nobody_where_it_only_lengthens_the_superframe():
         paper_lab_site(), ring.at(optimiser.even_layout(ring, 16).along_m, np.zeros(16, np.int64)), 1
     )
     floor = links.floor_of(site, FILE, None, (2.0, 2.0, 4.0, 6.0))
-    more = optimiser.one_more(site, SETTINGS, floor, ring, (0.0,))
+    more = optimiser.one_more(site, CHANNEL, floor, ring, (0.0,))
     assert not more.helps
     assert more.mean_after_m > 0.95 * more.mean_before_m
 
@@ -178,7 +178,7 @@ def test_warnings_name_what_is_wrong():
     wall = WallSite(3.0, -1.0, 3.0, 9.0, loss_db=25.0, delay_m=0.3)
     site = replace(paper_lab_site(), walls=(wall,))
     floor = links.floor_of(site, FILE, None, None)
-    predictor = Predictor(site, SETTINGS)
+    predictor = Predictor(site, CHANNEL)
     text = "\n".join(plan_warnings(predictor, floor, plan_map(predictor, grid_of(floor, (0.0,), 0.5))))
     assert (
         "anchors 2 (0%), 3 (0%), 4 (0%), 6 m or more from the master, receive this share of its frames and stay silent"
@@ -190,12 +190,12 @@ def test_warnings_name_what_is_wrong():
 def test_mirrors_are_told_by_the_solver():
     flat = Site("flat", 1, 1, tuple(replace(a, z_m=2.5) for a in paper_lab_site().anchors), tags=TagsSite())
     floor = links.floor_of(flat, FILE, None, None)
-    predictor = Predictor(flat, SETTINGS)
+    predictor = Predictor(flat, CHANNEL)
     warnings = plan_warnings(predictor, floor, plan_map(predictor, grid_of(floor, (1.0,), 1.0)))
     assert any("of the region has a mirror image" in warning for warning in warnings)
     assert any("one plane" in warning for warning in warnings)
     known = replace(flat, tags=TagsSite(1.0))
-    quiet = Predictor(known, SETTINGS)
+    quiet = Predictor(known, CHANNEL)
     assert plan_warnings(quiet, floor, plan_map(quiet, grid_of(floor, (1.0,), 1.0))) == []
 
 
@@ -228,7 +228,7 @@ def test_prediction_and_simulation_agree(monkeypatch, name, rounds):
     monkeypatch.setattr("skyless.research.verify._WORLDS", 8)
     site = paper_lab_site(accuracy=AccuracySite()) if name == "range errors" else SITES[name]
     floor = links.floor_of(site, FILE, None, None)
-    predictor = Predictor(site, SETTINGS)
+    predictor = Predictor(site, CHANNEL)
     heights = (1.0, 2.0) if name == "3-D" else (0.0,)
     grid = grid_of(floor, heights, 0.5)
     plan = plan_map(predictor, grid)
@@ -253,7 +253,7 @@ def test_a_site_from_places_keeps_the_rest():
 
 def test_range_decides_coverage():
     floor = links.floor_of(lab_site(), FILE, None, None)
-    near = PlanSettings(channel=links.with_range(ChannelModel(), 4.0))
+    near = links.with_range(ChannelModel(), 4.0)
     summary = summary_of(plan_map(Predictor(lab_site(), near), grid_of(floor, (0.0,), 0.5)))
     assert summary.covered_share < 1.0
     assert summary.fewest_anchors < 3

@@ -16,6 +16,7 @@ from skyless.core.errors import ConfigurationError
 from skyless.core.geometry import area, distance_outside, inside
 from skyless.core.site import AnchorSite, GeoreferenceSite, WallSite
 from skyless.sim.lab import paper_lab_site
+from skyless.site.channel import ChannelModel
 from skyless.site.planning import links, maps
 from skyless.site.planning import maps as plan_maps
 
@@ -27,9 +28,7 @@ LAB = paper_lab_site()
 
 def lab_map(step=0.5, site=LAB):
     floor = links.floor_of(site, Path("lab.toml"), None, None)
-    return plan_maps.plan_map(
-        plan_maps.Predictor(site, plan_maps.PlanSettings()), plan_maps.grid_of(floor, (0.0,), step)
-    )
+    return plan_maps.plan_map(plan_maps.Predictor(site, ChannelModel()), plan_maps.grid_of(floor, (0.0,), step))
 
 
 @given(x=st.floats(-2, 14), y=st.floats(-2, 11))

@@ -11,7 +11,7 @@ from skyless.core.site import AnchorSite, Site, TagsSite, WallSite
 from skyless.sim.lab import paper_lab_site
 from skyless.site.channel import ChannelModel, barriers_of
 from skyless.site.planning import links as prediction
-from skyless.site.planning.maps import PlanSettings, Predictor
+from skyless.site.planning.maps import Predictor
 from skyless.site.planning.superframe import stamp_variances, steady_clock
 
 pytestmark = pytest.mark.statistical
@@ -25,19 +25,19 @@ def points(count=40, seed=3, height=0.0):
 
 
 def test_dops_are_those_of_all_anchors_where_all_are_in_view():
-    table = Predictor(LAB, PlanSettings()).at(points())
+    table = Predictor(LAB, ChannelModel()).at(points())
     expected = dops_at(anchor_positions(LAB), points(), height_known=True)
     assert table[:, prediction.GDOP : prediction.TDOP + 1] == pytest.approx(expected, rel=1e-9)
 
 
 def test_the_labs_figure_comes_out():
     """RMSE of 30 000 simulated fixes at (3, 4), docs/maths.md section 5; standard error 1.5 %."""
-    table = Predictor(LAB, PlanSettings()).at(np.array([[3.0, 4.0, 0.0]]))
+    table = Predictor(LAB, ChannelModel()).at(np.array([[3.0, 4.0, 0.0]]))
     assert 100.0 * table[0, prediction.RMSE] == pytest.approx(1.33, rel=0.05)
 
 
 def test_what_the_filter_will_claim_comes_out():
-    table = Predictor(LAB, PlanSettings()).at(np.array([[3.0, 4.0, 0.0], [1.2, 1.6, 0.0]]))
+    table = Predictor(LAB, ChannelModel()).at(np.array([[3.0, 4.0, 0.0], [1.2, 1.6, 0.0]]))
     assert 100.0 * table[:, prediction.CLAIMED] == pytest.approx([1.54, 1.61], rel=0.01)
 
 
@@ -67,7 +67,7 @@ def test_links_are_the_simulations():
 
 
 def test_without_enough_anchors_there_is_no_fix():
-    short = PlanSettings(channel=prediction.with_range(ChannelModel(), 3.0))
+    short = prediction.with_range(ChannelModel(), 3.0)
     table = Predictor(LAB, short).at(points())
     assert np.isinf(table[:, prediction.SIGMA]).all()
     assert (table[:, prediction.FIX_SHARE] == 0.0).all()
@@ -77,7 +77,7 @@ def test_three_dimensions_have_heights():
     heights = (0.3, 2.7, 0.4, 2.8, 0.5, 2.5)
     anchors = tuple(replace(a, z_m=z) for a, z in zip(LAB.anchors, heights, strict=True))
     site = replace(LAB, anchors=anchors, tags=TagsSite())
-    table = Predictor(site, PlanSettings()).at(points(5, height=1.2))
+    table = Predictor(site, ChannelModel()).at(points(5, height=1.2))
     parts = table[:, [prediction.SIGMA_X, prediction.SIGMA_Y, prediction.SIGMA_Z]]
     assert (parts > 0.0).all()
     assert (parts**2).sum(axis=1) == pytest.approx(table[:, prediction.SIGMA] ** 2)
@@ -86,6 +86,6 @@ def test_three_dimensions_have_heights():
 def test_a_site_out_of_its_masters_reach_is_silent():
     anchors = (AnchorSite(1, 0.0, 0.0), AnchorSite(2, 5.0, 0.0), AnchorSite(3, 0.0, 5.0), AnchorSite(4, 90.0, 5.0))
     site = Site("far", 1, 1, anchors, tags=TagsSite(0.0))
-    predictor = Predictor(site, PlanSettings())
+    predictor = Predictor(site, ChannelModel())
     assert predictor.superframe.sent.tolist() == [1.0, 1.0, 1.0, 0.0]
     assert 3 not in predictor.superframe.sender

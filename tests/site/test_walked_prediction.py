@@ -13,7 +13,8 @@ from skyless.core.site import ScheduleSite
 from skyless.core.ticks import TICK_S
 from skyless.research.uncertainty import BoundSettings, tracking_bound
 from skyless.sim.lab import lab_site, paper_lab_site
-from skyless.site.planning.maps import PlanSettings, Predictor
+from skyless.site.channel import ChannelModel
+from skyless.site.planning.maps import Predictor
 
 pytestmark = pytest.mark.site
 
@@ -38,7 +39,7 @@ def test_the_filter_claims_the_bound_of_a_tag_that_has_walked(has_phases):
         phase_std_m=0.002 if has_phases else math.inf,
         phase_wander=1e-4,
     )
-    found = Predictor(LAB, PlanSettings()).walked_sigma(PLACE, has_phases=has_phases)
+    found = Predictor(LAB, ChannelModel()).walked_sigma(PLACE, has_phases=has_phases)
     ways = [(PLACE[0], np.eye(3)[0]), (PLACE[0], np.eye(3)[1]), (PLACE[1], -np.eye(3)[0]), (PLACE[1], -np.eye(3)[1])]
     for sigma_m, (place, way) in zip(found, ways, strict=True):
         steps_m = np.append(np.zeros(rested), np.arange(1, frames + 1) / frames)
@@ -49,7 +50,7 @@ def test_the_filter_claims_the_bound_of_a_tag_that_has_walked(has_phases):
 
 def test_phases_give_nothing_where_packets_are_too_rare_or_crystals_too_poor_for_their_cycles():
     def gain(site):
-        predictor = Predictor(site, PlanSettings())
+        predictor = Predictor(site, ChannelModel())
         with_phases, stamps = (predictor.walked_sigma(PLACE, has_phases=has_phases) for has_phases in (True, False))
         return stamps / with_phases
 

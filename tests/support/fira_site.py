@@ -15,7 +15,7 @@ from msgspec.structs import replace
 from skyless.core.site import AccuracySite
 from skyless.core.ticks import TICK_BITS
 from skyless.radio.foreign.fira import DtTag
-from skyless.radio.foreign.uci import AnchorFrame, UciReader
+from skyless.radio.foreign.uci import AnchorFrame
 from skyless.run.board import UciProtocol
 from skyless.run.masterless.packet_tracking import DL_TDOA, DL_TDOA_ONE_WAY, PacketTracking
 from skyless.sim.evaluation.fleet import world_of
@@ -23,8 +23,9 @@ from skyless.sim.evaluation.scenarios import Request, Room, impairments_of
 from skyless.sim.impairments import RangeErrorModel
 from skyless.sim.lab import paper_lab_site
 from skyless.sim.trajectory import Static
-from skyless.site.planning.links import PLAN_COLUMNS, RMSE
-from skyless.site.planning.maps import PlanSettings, Predictor, fill_joint_sigma
+from skyless.site.channel import ChannelModel
+from skyless.site.planning.links import RMSE
+from skyless.site.planning.maps import Predictor
 from skyless.site.planning.superframe import Relays, Superframe
 
 POINTS_M = np.array([(2.0, 3.0), (1.0, 1.0), (4.5, 6.0), (3.0, 4.0), (5.0, 2.0), (0.7, 7.0)])
@@ -52,13 +53,13 @@ class Measured(NamedTuple):
 
 def planned_m(site):
     """RMSE over the points by ``skyless plan``."""
-    table = Predictor(site, PlanSettings()).at(PLACES_M)
+    table = Predictor(site, ChannelModel()).at(PLACES_M)
     return math.sqrt(float(np.mean(table[:, RMSE] ** 2)))
 
 
 def round_planned_m(site, settings):
     """The same where tags receive a round's messages only, which relay the poll, or the responses in the final one."""
-    planner = Predictor(site, PlanSettings())
+    planner = Predictor(site, ChannelModel())
     superframe, relays, master = planner.superframe, planner.relays, planner.master
     messages = len(site.anchors) + site.schedule.frames_per_node - 1
     begins, ends, kept = [0, *relays.ends[:-1].tolist()], [], []
@@ -71,9 +72,9 @@ def round_planned_m(site, settings):
     gaps_s[0] += superframe.gap_s[messages:].sum()
     superframe = Superframe(superframe.sent, superframe.sender[:messages], gaps_s)
     rest = (column[kept].copy() for column in relays[1:])
-    table = np.zeros((len(PLACES_M), len(PLAN_COLUMNS)))
-    relays = Relays(np.array(ends, np.int64), *rest)
-    fill_joint_sigma(PLACES_M, settings, planner.scene, superframe, relays, planner.farthest_m, table)
+    planner.estimator, planner.superframe = settings, superframe
+    planner.relays = Relays(np.array(ends, np.int64), *rest)
+    table = planner.at(PLACES_M)
     return math.sqrt(float(np.mean(table[:, RMSE] ** 2)))
 
 
@@ -102,7 +103,7 @@ class Tag:
     def __init__(self, version):
         drops, self._stream = Counter(), bytearray()
         self._board = UciProtocol(self._hear, version)
-        self._reader, self._tag = UciReader(drops), DtTag(drops, AnchorFrame())
+        self._tag = DtTag(drops, AnchorFrame())
         one_way = DL_TDOA_ONE_WAY.changed(**KNOWN)
         self._tracking = PacketTracking(DL_TDOA.changed(**KNOWN), {}, TICK_BITS, one_way=one_way)
 
@@ -113,9 +114,9 @@ class Tag:
     def fixes(self, reception):
         """Fixes that a reception of the board completes."""
         self._board.on_radio_event(reception)
-        packets = self._reader.feed(bytes(self._stream))
+        packets = list(self._tag.feed(bytes(self._stream)))
         self._stream.clear()
-        found = [self._tracking.on_packet(one) for packet in packets for one in self._tag.on_uci(packet)]
+        found = [self._tracking.on_packet(packet) for packet in packets]
         return [fix for fix in found if fix is not None]
 
 

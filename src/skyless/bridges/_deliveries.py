@@ -172,12 +172,9 @@ class AlarmTarget(Target):
 
 
 def _states(alarm: AlarmMessage) -> list[What]:
-    states: list[What] = ["raised"]
-    if alarm.acknowledged_unix_s is not None:
-        states.append("acknowledged")
-    if alarm.ended_unix_s is not None:
-        states.append("ended")
-    return states
+    times: dict[What, float | None] = {"raised": alarm.unix_s}
+    times |= {"acknowledged": alarm.acknowledged_unix_s, "ended": alarm.ended_unix_s}
+    return [what for what, at in times.items() if at is not None]
 
 
 async def _in_thread(work: Callable[[Open], None]) -> None:

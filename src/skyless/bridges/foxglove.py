@@ -14,7 +14,7 @@ from collections import deque
 from collections.abc import Callable, Collection, Sequence
 from http import HTTPStatus
 from struct import Struct as Format
-from typing import Annotated, Any, Final
+from typing import Annotated, Final
 
 import msgspec
 from msgspec import Meta, Struct
@@ -109,26 +109,17 @@ def decode_request(data: str | bytes) -> Request | None:
 
 def server_info(name: str, session: str) -> str:
     """The first message to a client; with another ``session`` it discards what it had from this server."""
-    return _text(
-        {
-            "op": "serverInfo",
-            "name": name,
-            "capabilities": [],
-            "supportedEncodings": [],
-            "metadata": {},
-            "sessionId": session,
-        }
-    )
+    return _text("serverInfo", name=name, capabilities=[], supportedEncodings=[], metadata={}, sessionId=session)
 
 
 def advertise(channels: Sequence[Channel]) -> str:
     """Announce channels."""
-    return _text({"op": "advertise", "channels": channels})
+    return _text("advertise", channels=channels)
 
 
 def status(level: int, message: str) -> str:
     """A line for the client's user."""
-    return _text({"op": "status", "level": level, "message": message})
+    return _text("status", level=level, message=message)
 
 
 def message_data(subscription: int, unix_s: float, payload: bytes) -> bytes:
@@ -139,8 +130,8 @@ def message_data(subscription: int, unix_s: float, payload: bytes) -> bytes:
     return _MESSAGE_DATA.pack(1, subscription, time_ns) + payload
 
 
-def _text(value: dict[str, Any]) -> str:
-    return msgspec.json.encode(value).decode()
+def _text(op: str, **fields: object) -> str:
+    return msgspec.json.encode({"op": op, **fields}).decode()
 
 
 STUCK_S: Final = 10.0

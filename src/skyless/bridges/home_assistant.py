@@ -24,7 +24,7 @@ from skyless.core.version import installed_version
 from skyless.run.mqtt.address import MqttAddress, mqtt_address
 from skyless.run.mqtt.connection import Limits
 from skyless.run.mqtt.link import Link
-from skyless.run.mqtt.messages import Asset, FixMessage, TagPosition, TagZones, Vector, Zone
+from skyless.run.mqtt.messages import Asset, FixMessage, TagPosition, TagZones, WrongMessageError, Zone, read_message
 from skyless.run.mqtt.topics import status_topic, tag_position_topic, tag_zones_topic
 from skyless.run.site_table import THRESHOLDS
 from skyless.run.zones import ZoneMonitor
@@ -133,8 +133,8 @@ def _occupancy(zone: Zone, topic: str) -> Component:
 def platforms(kept: bytes) -> dict[str, str]:
     """Platforms of a document's components by key, without removed ones. Empty for anything else."""
     try:
-        components = msgspec.json.decode(kept, type=_Document).components
-    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError):
+        components = read_message(kept, _Document).components
+    except WrongMessageError:
         return {}
     return {key: component.platform for key, component in components.items() if component.unique_id}
 
@@ -287,19 +287,8 @@ class Announcer:
         if tag.position is not None and _are_alike(std_m, tag.position.std_m):
             std_m, horizontal_std_m = tag.position.std_m, tag.position.horizontal_std_m
         origin = self._site.georeference
-        latitude_deg, longitude_deg, height_m = (
-            (None, None, None) if origin is None else _rounded(geodetic(fix.position_m, origin))
-        )
-        tag.position = TagPosition(
-            tag=tag.name,
-            unix_s=fix.unix_s,
-            position_m=fix.position_m,
-            std_m=std_m,
-            horizontal_std_m=horizontal_std_m,
-            latitude_deg=latitude_deg,
-            longitude_deg=longitude_deg,
-            height_m=height_m,
-        )
+        place = () if origin is None else map(round, geodetic(fix.position_m, origin), (8, 8, 3))
+        tag.position = TagPosition(tag.name, fix.unix_s, fix.position_m, std_m, horizontal_std_m, *place)
         self._publish(tag_position_topic(self._site.id, tag.name), tag.position)
 
     def _publish(self, topic: str, message: Struct | bytes) -> None:
@@ -342,8 +331,8 @@ class Announcer:
     def _on_kept_zones(self, _topic: str, payload: bytes) -> None:
         """Process this bridge's statement from before its restart, which must not persist if the tag has gone."""
         try:
-            kept = msgspec.json.decode(payload, type=TagZones)
-        except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError):
+            kept = read_message(payload, TagZones)
+        except WrongMessageError:
             return
         if kept.usable and kept.by == self._name and TAG_NAME.fullmatch(kept.tag) and len(self._kept) < MAX_ANNOUNCED:
             self._kept[kept.tag] = round(THRESHOLDS.longest_s)
@@ -358,11 +347,6 @@ def _stds_m(fix: FixMessage) -> tuple[float, float]:
     """Radial standard deviations in space and on the floor."""
     variances = floored(fix.covariance_m2)[::4]
     return round(sqrt(sum(variances)), 3), round(sqrt(sum(variances[:2])), 3)
-
-
-def _rounded(position: Vector) -> Vector:
-    latitude_deg, longitude_deg, height_m = position
-    return round(latitude_deg, 8), round(longitude_deg, 8), round(height_m, 3)
 
 
 _PREFIX: Final = re.compile(r"[A-Za-z0-9_-]+(/[A-Za-z0-9_-]+)*")
@@ -381,10 +365,20 @@ class HomeAssistant(Target):
     The bridge's name on MQTT includes that tag's name, so that bridges on one computer are distinct.
     """
 
-    def __init__(self, context: BridgeContext, text: str, address: MqttAddress, prefix: str, move_m: float) -> None:
-        """``prefix`` of discovery. A position is sent again when the tag has moved by ``move_m``."""
-        super().__init__(text)
-        self._context, self._address, self._prefix, self._move_m = context, address, prefix, move_m
+    def __init__(self, url: TargetUrl, context: BridgeContext) -> None:
+        """``homeassistant:`` or ``homeassistant://[USER[:PASSWORD]@]HOST[:PORT]``. Raises SkylessError.
+
+        Keys: ``tls=yes|no`` of a broker that the address names; ``prefix`` of discovery; ``move_m``, by which a tag has
+        to move for its position to be sent again.
+        """
+        super().__init__(url.text)
+        tls = url.choice("tls", ("no", "yes"), "no") == "yes"
+        self._prefix = url.text_option("prefix", "homeassistant")
+        if not _PREFIX.fullmatch(self._prefix):
+            right = "letters, digits, -, _ and / between them"
+            raise SkylessError(f"the target {url.text!r} has prefix={self._prefix}; it should be {right}")
+        self._move_m = url.number("move_m", 0.25, 0.0, 100.0)
+        self._address, self._log = _broker(url, context, tls=tls), context.log
         self._site: BridgedSite | None = None
         self._announcer: Announcer | None = None
         self._link: Link | None = None
@@ -399,7 +393,7 @@ class HomeAssistant(Target):
                 self._announcer.on_site_left(time.time())
             raise SkylessError(f"{self.text} serves site {self._site.id}, not site {site.id}; start the bridge again")
         if site.georeference is None and (self._site is None or self._site.georeference is not None):
-            self._context.log(
+            self._log(
                 f"{self.text} gives rooms, but no position on the map: site {site.id} ({site.name}) does not say where "
                 "it is; its site file should have [georeference] with latitude_deg and longitude_deg"
             )
@@ -439,19 +433,7 @@ class HomeAssistant(Target):
         self._begun.set()
 
 
-def make_target(url: TargetUrl, context: BridgeContext) -> HomeAssistant:
-    """``homeassistant:`` or ``homeassistant://[USER[:PASSWORD]@]HOST[:PORT]``.
-
-    Keys: ``tls=yes|no`` of a broker that the address names, ``prefix`` of discovery, ``move_m``. Raises SkylessError.
-    """
-    tls = url.choice("tls", ("no", "yes"), "no") == "yes"
-    prefix = url.text_option("prefix", "homeassistant")
-    if not _PREFIX.fullmatch(prefix):
-        raise SkylessError(
-            f"the target {url.text!r} has prefix={prefix}; it should be letters, digits, -, _ and / between them"
-        )
-    move_m = url.number("move_m", 0.25, 0.0, 100.0)
-    return HomeAssistant(context, url.text, _broker(url, context, tls=tls), prefix, move_m)
+make_target: Final = HomeAssistant
 
 
 def _broker(url: TargetUrl, context: BridgeContext, *, tls: bool) -> MqttAddress:

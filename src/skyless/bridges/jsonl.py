@@ -7,34 +7,11 @@ from collections.abc import Mapping
 from typing import Final
 
 import msgspec
-from msgspec import UNSET, Struct, UnsetType
 
 from skyless.bridges.target import BridgeContext, BridgedSite, Encoder, TargetUrl
-from skyless.core.site import GeoreferenceSite
-from skyless.run.mqtt.messages import Asset, FixMessage, Vector
+from skyless.run.mqtt.messages import Asset, FixMessage
 
 _encode: Final = msgspec.json.Encoder().encode
-
-
-class SiteLine(Struct, frozen=True, tag="site"):
-    """The site: first for each new reader, and after each change."""
-
-    id: int
-    name: str
-    simulated: bool
-    anchors_m: dict[int, Vector]
-    georeference: GeoreferenceSite | None
-
-
-class NoFixLine(Struct, frozen=True, tag="no_fix"):
-    """A known tag has no usable fix: once a second while that lasts."""
-
-    tag: str
-    unix_s: float
-    reason: str
-    name: str | UnsetType = UNSET
-    """Name of the tag's asset, if it has one; likewise its group."""
-    group: str | UnsetType = UNSET
 
 
 class JsonLines(Encoder):
@@ -45,13 +22,14 @@ class JsonLines(Encoder):
         self._assets: Mapping[str, Asset] = {}
 
     def greeting(self) -> list[bytes]:
-        """The site, once known."""
+        """The site, once known: first for each new reader."""
         return [self._site] if self._site else []
 
     def on_site(self, site: BridgedSite) -> list[bytes]:
-        """The site."""
+        """The site, after each change."""
         self._assets = site.assets
-        self._site = _line(SiteLine(site.id, site.name, site.simulated, site.anchors_m, site.georeference))
+        named = {"type": "site", "id": site.id, "name": site.name, "simulated": site.simulated}
+        self._site = _line({**named, "anchors_m": site.anchors_m, "georeference": site.georeference})
         return [self._site]
 
     def on_fix(self, fix: FixMessage) -> list[bytes]:
@@ -59,15 +37,16 @@ class JsonLines(Encoder):
         return [_encode({"type": "fix", **self._names(fix.tag)})[:-1] + b"," + _line(fix)[1:]]
 
     def on_no_fix(self, tag: str, unix_s: float, reason: str) -> list[bytes]:
-        """That there is no fix."""
-        return [_line(NoFixLine(tag, unix_s, reason, **self._names(tag)))]
+        """That there is no fix: once a second while that lasts."""
+        return [_line({"type": "no_fix", "tag": tag, "unix_s": unix_s, "reason": reason, **self._names(tag)})]
 
     def _names(self, tag: str) -> dict[str, str]:
+        """Name and group of the tag's asset, as far as it has them."""
         asset = self._assets.get(tag, Asset(tag))
         return {key: value for key, value in (("name", asset.name), ("group", asset.group)) if value}
 
 
-def _line(value: Struct) -> bytes:
+def _line(value: object) -> bytes:
     return _encode(value) + b"\n"
 
 

@@ -339,9 +339,7 @@ def vision_position_estimate(fix: FixMessage, heading_deg: float, reset_counter:
         roll=atan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y)),
         pitch=asin(max(min(2.0 * (w * y - z * x), 1.0), -1.0)),
         yaw=atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z)),
-        covariance=_with_angles(
-            fix, _pose_covariance(_covariance_ned(fix.covariance_m2, heading_deg), 0.0, UNKNOWN_ANGLE_RAD2)
-        ),
+        covariance=_pose_covariance(fix, _covariance_ned(fix.covariance_m2, heading_deg), 0.0, UNKNOWN_ANGLE_RAD2),
         reset_counter=reset_counter & 0xFF,
     )
 
@@ -358,7 +356,7 @@ def odometry(fix: FixMessage, heading_deg: float, reset_counter: int) -> Odometr
         q=_orientation_ned(fix, heading_deg) or (NAN, NAN, NAN, NAN),
         velocity=(NAN, NAN, NAN),
         rates=(NAN, NAN, NAN),
-        pose_covariance=_with_angles(fix, _pose_covariance(covariance_m2, NAN, NAN)),
+        pose_covariance=_pose_covariance(fix, covariance_m2, NAN, NAN),
         velocity_covariance=UNKNOWN_21,
         frame_id=LOCAL_NED,
         child_frame_id=LOCAL_NED,
@@ -411,17 +409,6 @@ def no_gps_fix(unix_s: float) -> GpsInput:
     return GpsInput(time_us=micros(unix_s), time_week_ms=week_ms, time_week=week)
 
 
-def global_origin(origin: GeoreferenceSite, target_system: int, unix_s: float) -> SetGpsGlobalOrigin:
-    """The site's origin, to become the vehicle's."""
-    return SetGpsGlobalOrigin(
-        latitude_1e7=round(origin.latitude_deg * 1e7),
-        longitude_1e7=round(origin.longitude_deg * 1e7),
-        altitude_mm=round(origin.height_m * 1e3),
-        target_system=target_system,
-        time_us=micros(unix_s),
-    )
-
-
 def gps_time(unix_s: float) -> tuple[int, int]:
     """GPS week and milliseconds into it; (0, 0) before 1980 or after week 65535.
 
@@ -459,19 +446,16 @@ def _orientation_ned(fix: FixMessage, heading_deg: float) -> tuple[float, float,
     return sqrt(0.5) * (w + z), sqrt(0.5) * (x + y), sqrt(0.5) * (x - y), sqrt(0.5) * (w - z)
 
 
-def _with_angles(fix: FixMessage, covariance: tuple[float, ...]) -> tuple[float, ...]:
-    """The covariance of a pose with the variances of roll, pitch and heading, where the orientation is known."""
-    if fix.heading_std_rad is None:
-        return covariance
-    level, heading = LEVEL_VARIANCE, fix.heading_std_rad**2
-    return *covariance[:15], level, 0.0, 0.0, level, 0.0, heading
+def _pose_covariance(fix: FixMessage, covariance: Matrix, between: float, unknown: float) -> tuple[float, ...]:
+    """Upper triangle by rows of a 6 × 6 covariance: the position's, ``between`` that and angles, and the angles'.
 
-
-def _pose_covariance(covariance: Matrix, between: float, angle: float) -> tuple[float, ...]:
-    """Upper triangle by rows of a 6 × 6 covariance: ``covariance``, ``angle`` for angles, ``between`` elsewhere."""
+    These are roll, pitch and heading, with the variance ``unknown`` where the orientation is not known.
+    """
     nn, ne, nd, _, ee, ed, _, _, dd = covariance
-    b, a = between, angle
-    return nn, ne, nd, b, b, b, ee, ed, b, b, b, dd, b, b, b, a, b, b, a, b, a
+    b, a, heading, apart = between, unknown, unknown, between
+    if fix.heading_std_rad is not None:
+        a, heading, apart = LEVEL_VARIANCE, fix.heading_std_rad**2, 0.0
+    return nn, ne, nd, b, b, b, ee, ed, b, b, b, dd, b, b, b, a, apart, apart, a, apart, heading
 
 
 AUTOPILOT: Final = 1
@@ -627,10 +611,16 @@ class MavlinkEncoder(Encoder):
             following.on_position(unix_s, values[:3])
 
     def _origin(self, unix_s: float) -> SetGpsGlobalOrigin | None:
-        """None if the site has none, or the vehicle derives it from GPS_INPUT."""
-        if self._site is None or self._site.georeference is None or self._profile == "gps":
+        """The site's origin, to become the vehicle's; None if it has none, or the vehicle derives it from GPS_INPUT."""
+        if self._site is None or (origin := self._site.georeference) is None or self._profile == "gps":
             return None
-        return global_origin(self._site.georeference, self._system, unix_s)
+        return SetGpsGlobalOrigin(
+            latitude_1e7=round(origin.latitude_deg * 1e7),
+            longitude_1e7=round(origin.longitude_deg * 1e7),
+            altitude_mm=round(origin.height_m * 1e3),
+            target_system=self._system,
+            time_us=micros(unix_s),
+        )
 
     def _compare_origin(self, vehicle: GpsGlobalOrigin, unix_ns: int) -> None:
         """Log a difference between the vehicle's origin and the site's."""

@@ -17,7 +17,7 @@ from typing import Final, cast
 import msgspec
 from msgspec import Struct
 
-from skyless.bridges.mavlink import CRC_EXTRAS, HIGHRES_IMU, Frame, FrameReader, decoded
+from skyless.bridges.mavlink import CRC_EXTRAS, HIGHRES_IMU, FrameReader, decoded
 from skyless.bridges.target import TargetUrl
 from skyless.core.errors import SkylessError
 from skyless.core.motion_sample import MotionSample, ShortestLatency
@@ -132,12 +132,9 @@ class MotionFeed:
     def feed_mavlink(self, data: bytes) -> None:
         """Process a datagram of frames."""
         for frame in self._frames.frames(data):
-            self._take(frame)
-
-    def _take(self, frame: Frame) -> None:
-        when_us, x, y, z, p, q, r = cast(tuple[float, ...], decoded(frame))  # forward, right, down
-        time_s = when_us * 1e-6 - self._vehicle.ahead_s(self._clock(), when_us * 1e-6)
-        self._pass(MotionSample(time_s, (p, -q, -r), (x, -y, -z), arm_m=self._arm_m))
+            when_us, x, y, z, p, q, r = cast(tuple[float, ...], decoded(frame))  # forward, right, down
+            time_s = when_us * 1e-6 - self._vehicle.ahead_s(self._clock(), when_us * 1e-6)
+            self._pass(MotionSample(time_s, (p, -q, -r), (x, -y, -z), arm_m=self._arm_m))
 
     def _host_s(self, unix_s: float | None) -> float:
         """A time on the host's clock; without one the present."""

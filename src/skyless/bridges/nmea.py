@@ -166,18 +166,24 @@ def _angle(angle_deg: float, hemispheres: str, digits: int) -> str:
     return f"{whole:0{digits}d}{minutes:02d}.{fraction:07d},{hemispheres[angle_deg < 0.0]}"
 
 
-def _motion(fix: FixMessage, heading_deg: float) -> tuple[str, str]:
-    """Speed over ground in knots, and the course if there is one; empty if the velocity is unknown."""
+def over_ground(fix: FixMessage, heading_deg: float) -> tuple[float | None, float | None]:
+    """Speed over ground in m/s, and the course in degrees (-180 to 180) of a moving tag, as far as they are known."""
     if fix.velocity_mps is None or fix.velocity_covariance is None:
-        return "", ""
+        return None, None
     east, north, _ = east_north_up(fix.velocity_mps, heading_deg)
     speed_mps = hypot(east, north)
-    if not speed_mps < _FARTHEST_M:
-        return "", ""
     variance = fix.velocity_covariance[0] + fix.velocity_covariance[4]
     moving = speed_mps > 0.0 and speed_mps**2 > COURSE_SIGMAS**2 * variance
-    course = round(degrees(atan2(east, north)) * 100.0) % 36_000 / 100.0
-    return f"{speed_mps / KNOT_MPS:.3f}", f"{course:.2f}" if moving else ""
+    return speed_mps, degrees(atan2(east, north)) if moving else None
+
+
+def _motion(fix: FixMessage, heading_deg: float) -> tuple[str, str]:
+    """Speed over ground in knots, and the course if there is one; empty if the velocity is unknown."""
+    speed_mps, course_deg = over_ground(fix, heading_deg)
+    if speed_mps is None or not speed_mps < _FARTHEST_M:
+        return "", ""
+    course = "" if course_deg is None else f"{round(course_deg * 100.0) % 36_000 / 100.0:.2f}"
+    return f"{speed_mps / KNOT_MPS:.3f}", course
 
 
 def _dop(value: float | None) -> str:

@@ -10,7 +10,6 @@ import re
 import time
 from collections import deque
 from datetime import UTC, datetime
-from math import atan2, degrees, hypot
 from typing import Any, Final
 from urllib.parse import quote
 from uuid import NAMESPACE_URL, uuid5
@@ -20,9 +19,9 @@ from websockets.asyncio.client import ClientConnection, connect
 from websockets.exceptions import WebSocketException
 
 from skyless.bridges._deliveries import read_secret
-from skyless.bridges.nmea import COURSE_SIGMAS
+from skyless.bridges.nmea import over_ground
 from skyless.bridges.target import BridgeContext, BridgedSite, Target, TargetUrl, floored
-from skyless.core.earth import coordinates, east_north_up, horizontal_ellipse
+from skyless.core.earth import coordinates, horizontal_ellipse
 from skyless.run.mqtt.address import is_loopback
 from skyless.run.mqtt.messages import FixMessage
 from skyless.run.process import RateLimit, together
@@ -56,13 +55,7 @@ def location(fix: FixMessage, site: BridgedSite, source: str) -> Object:
     local_m = [round(value, 4) for value in (x_m, y_m, z_m - ground_m)]
     asset = site.assets.get(fix.tag)
     named = asset is not None and asset.name
-    speed_mps = course_deg = None
-    if fix.velocity_mps is not None and fix.velocity_covariance is not None:
-        east, north, _ = east_north_up(fix.velocity_mps, 0.0 if earth is None else earth.heading_deg)
-        speed_mps = hypot(east, north)
-        variance = fix.velocity_covariance[0] + fix.velocity_covariance[4]
-        if earth is not None and speed_mps > 0.0 and speed_mps**2 > COURSE_SIGMAS**2 * variance:
-            course_deg = round(degrees(atan2(east, north)), 2) % 360.0
+    speed_mps, course_deg = over_ground(fix, 0.0 if earth is None else earth.heading_deg)
     return _known(
         position={"type": "Point", "coordinates": local_m if earth is None else coordinates(fix.position_m, earth)},
         source=source,
@@ -74,7 +67,7 @@ def location(fix: FixMessage, site: BridgedSite, source: str) -> Object:
         accuracy=round(horizontal_ellipse(floored(fix.covariance_m2))[0], 4),
         floor=floor,
         speed=speed_mps,
-        course=course_deg,
+        course=None if earth is None or course_deg is None else round(course_deg, 2) % 360.0,
         trackables=[uuid5(NAMESPACE_URL, f"skyless:{site.id}/trackable/{fix.tag}")] if named else None,
         properties={"simulated": True} if site.simulated else None,
     )

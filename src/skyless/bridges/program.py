@@ -71,14 +71,14 @@ class BridgeNode:
         self._assets = AssetsMessage(())
         self._refused: asyncio.Future[None] | None = None
         self.feed = feed = SiteFeed()
-        feed.on(SiteMessage, lambda message, _: self._on_site(message))
-        feed.on(ZonesMessage, lambda message, _: self._on_zones(message or ZonesMessage(())))
-        feed.on(AssetsMessage, lambda message, _: self._on_assets(message or AssetsMessage(())))
+        feed.on(SiteMessage, lambda message, _: self._update_site(site=message) if message else None)
+        feed.on(ZonesMessage, lambda message, _: self._update_site(zones=message or ZonesMessage(())))
+        feed.on(AssetsMessage, lambda message, _: self._update_site(assets=message or AssetsMessage(())))
         feed.on(FixMessage, lambda fix, _: self._on_fix(fix))
         for kind in (TagHealth, AnchorHealth):
             feed.on(kind, lambda health, _: self.hub.on_health(health, time.monotonic()))
         feed.on(StatusMessage, lambda status, _: self._on_status(status))
-        feed.on(AlarmMessage, lambda alarm, _: self._on_alarm(alarm))
+        feed.on(AlarmMessage, lambda alarm, _: self.hub.on_alarm(alarm) if alarm else None)
         feed.attach(self.link, site)
         self.link.on_state.append(self._on_state)
 
@@ -104,33 +104,20 @@ class BridgeNode:
         if status is not None and status.kind in ("tag", "anchor"):
             self.hub.on_status(status, time.monotonic(), time.time())
 
-    def _on_alarm(self, alarm: AlarmMessage | None) -> None:
-        if alarm is not None:
-            self.hub.on_alarm(alarm)
-
-    def _on_site(self, message: SiteMessage | None) -> None:
-        if message is not None:
-            self._site = message
-            self._update_site()
-
-    def _on_zones(self, message: ZonesMessage) -> None:
-        self._zones = message
-        self._update_site()
-
-    def _on_assets(self, message: AssetsMessage) -> None:
-        self._assets = message
-        self._update_site()
-
-    def _update_site(self) -> None:
+    def _update_site(
+        self, site: SiteMessage | None = None, zones: ZonesMessage | None = None, assets: AssetsMessage | None = None
+    ) -> None:
+        """Give the hub the site after a message that says a part of it."""
+        self._site, self._zones, self._assets = site or self._site, zones or self._zones, assets or self._assets
         if self._site is None:
             return
-        site = self._site.whole_site
-        zones = zones_of(self._zones, site.name).zones
-        assets = assets_at(self._assets, site.name)
-        self.hub.table.set_site(site, time.monotonic(), addresses=self._site.system == "dl-tdoa")
-        self.hub.table.set_assets(assets)
+        whole = self._site.whole_site
+        by_tag = assets_at(self._assets, whole.name)
+        self.hub.table.set_site(whole, time.monotonic(), addresses=self._site.system == "dl-tdoa")
+        self.hub.table.set_assets(by_tag)
         try:
-            bridged = bridged_site(site, zones, simulated=self._site.simulated, assets=assets)
+            inside = zones_of(self._zones, whole.name).zones
+            bridged = bridged_site(whole, inside, simulated=self._site.simulated, assets=by_tag)
             self.hub.on_site(bridged if self._site.system is UNSET else structs.replace(bridged, master=None))
         except SkylessError as error:
             if self._refused is not None and not self._refused.done():
@@ -189,18 +176,16 @@ class TagBridge:
         if self._is_here(fix.tag):
             self._hub.on_fix(fix, time.monotonic())
 
-    def on_health(self, health: TagHealth, receiver: "SiteListener") -> None:
-        """Process a tag's state, once a second, and its knowledge of the site."""
+    def on_health(self, health: TagHealth, receiver: "SiteListener | None" = None) -> None:
+        """Process a tag's state, once a second, and its knowledge of the site; None at another system."""
         now_s = time.monotonic()
-        self._receivers[health.tag] = receiver
-        site = self._sites.setdefault(health.tag, _HeardSite()).update(receiver, now_s, simulated=self._is_simulated())
-        if site is not None and (self._is_here(health.tag) or not any(map(self._is_here, self._receivers))):
-            self.on_site(site)
+        if receiver is not None:
+            self._receivers[health.tag] = receiver
+            heard = self._sites.setdefault(health.tag, _HeardSite())
+            site = heard.update(receiver, now_s, simulated=self._is_simulated())
+            if site is not None and (self._is_here(health.tag) or not any(map(self._is_here, self._receivers))):
+                self.on_site(site)
         self._hub.on_health(health, now_s)
-
-    def on_system_health(self, health: TagHealth) -> None:
-        """Process the state of a tag of another system, whose anchors are configured."""
-        self._hub.on_health(health, time.monotonic())
 
     def on_site(self, site: BridgedSite) -> None:
         """Add the site as one tag knows it: at a large site no tag receives all anchors."""

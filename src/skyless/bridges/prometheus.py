@@ -7,7 +7,7 @@ their source is fresh, so that nothing old looks current.
 import asyncio
 import time
 from collections import Counter
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from email.parser import BytesHeaderParser
 from typing import Final, TypeVar
 
@@ -332,13 +332,17 @@ class Prometheus(SiteMetrics):
     limit of time and bytes, and if there are too many the oldest is closed, so that none can block a scrape.
     """
 
-    def __init__(self, text: str, host: str, port: int, names: Collection[str] = (), *, positions: bool) -> None:
-        """``names``: further host names by which it is reached, besides the computer's own and its addresses."""
-        super().__init__(SiteTable(0.0), text=text, positions=positions)
-        self._names = {*own_names(host), *names}
-        self.port = port
+    def __init__(self, url: TargetUrl, _context: BridgeContext) -> None:
+        """``prometheus://[HOST][:PORT]``; with ``position=yes`` it gives where tags are. Raises SkylessError.
+
+        ``hosts=`` has further names by which others reach it, with commas.
+        """
+        names = [name.lower() for name in url.text_option("hosts").split(",") if name]
+        positions = url.choice("position", ("no", "yes"), "no") == "yes"
+        super().__init__(SiteTable(0.0), text=url.text, positions=positions)
+        self._host, self.port = url.host(), url.port(_PORT)
         """The port in use; with 0 configured, known once the server runs."""
-        self._host = host
+        self._names = {*own_names(self._host), *names}
         self._open: dict[asyncio.StreamWriter, None] = {}
         """Oldest first."""
 
@@ -402,11 +406,4 @@ def _response(status: str, text: str, content_type: str = "text/plain; charset=u
     return head.encode() + body
 
 
-def make_target(url: TargetUrl, _context: BridgeContext) -> Prometheus:
-    """``prometheus://[HOST][:PORT]``; with ``position=yes`` it gives where tags are. Raises SkylessError.
-
-    ``hosts=`` has names by which others reach it, with commas.
-    """
-    names = [name.lower() for name in url.text_option("hosts").split(",") if name]
-    positions = url.choice("position", ("no", "yes"), "no") == "yes"
-    return Prometheus(url.text, url.host(), url.port(_PORT), names, positions=positions)
+make_target: Final = Prometheus

@@ -22,6 +22,7 @@ import numpy as np
 from msgspec import Struct
 
 from skyless.bridges.target import BridgedSite, bridged_site, floored, is_usable
+from skyless.bridges.vehicle import known_velocity
 from skyless.core.arrays import Array
 from skyless.core.earth import geodetic, rotated
 from skyless.core.errors import ConfigurationError, SkylessError, writing
@@ -36,7 +37,7 @@ from skyless.run.mqtt.messages import (
     TruthMessage,
     Vector,
 )
-from skyless.run.recordings.recording import NS, McapRecording, Recorded
+from skyless.run.recordings.recording import NS, McapRecording
 
 if TYPE_CHECKING:
     from rosbags.interfaces import Connection, Qos
@@ -211,12 +212,10 @@ def _pose(fix: FixMessage, covariance_m2: Matrix, frame: str) -> bytes:
 
 def _velocity(fix: FixMessage, frame: str) -> bytes | None:
     """``geometry_msgs/TwistWithCovarianceStamped`` in the site's frame; None where it is not known."""
-    if fix.velocity_mps is None or fix.velocity_covariance is None:
+    if (moving := known_velocity(fix)) is None:
         return None
-    if not all(map(isfinite, (*fix.velocity_mps, *fix.velocity_covariance))):
-        return None
-    twist = _made("geometry_msgs/msg/Twist", _vector(*fix.velocity_mps), _vector(0.0, 0.0, 0.0))
-    covariance = _with_angles(fix.velocity_covariance)
+    twist = _made("geometry_msgs/msg/Twist", _vector(*moving[0]), _vector(0.0, 0.0, 0.0))
+    covariance = _with_angles(moving[1])
     return _cdr(TWIST, _header(fix.unix_s, frame), _made("geometry_msgs/msg/TwistWithCovariance", twist, covariance))
 
 
@@ -335,37 +334,31 @@ def write_bag(
         if site is None:
             raise SkylessError(f"{source.summary().path} holds no site; it should be a recording of skyless record")
         with writing(folder), _new_folder(Path(folder)) as scratch, _BagWriter(scratch, version) as writer:
-            return _copy(source, site, writer, encoder, tag, folder)
+            waiting = encoder.on_site(bridged_site(site.site, simulated=site.simulated))
+            fixes: Counter[bool] = Counter()
+            start_s = end_s = 0.0
+            for found in source.messages(_KINDS):
+                start_s, end_s = start_s or found.time_s, found.time_s
+                if isinstance(found.message, FixMessage) and tag in (None, found.message.tag):
+                    fixes[is_usable(found.message)] += 1
+                for message in (*waiting, *_messages_of(found.message, encoder, tag)):
+                    writer.write(message, found.time_s)
+                waiting = []
+            summary, topics = source.summary(), dict(sorted(writer.topics.items()))
+            return Bag(
+                path=str(folder),
+                start_s=start_s,
+                end_s=end_s,
+                topics={name: writer.count(topic) for name, topic in topics.items()},
+                types={name: topic.msgtype for name, topic in topics.items()},
+                fixes=fixes[True],
+                unusable=fixes[False],
+                drops={reason: count for reason, count in summary.drops.items() if count},
+                finished=summary.finished,
+            )
 
 
-def _copy(
-    source: McapRecording,
-    site: SiteMessage,
-    writer: "_BagWriter",
-    encoder: RosEncoder,
-    tag: str | None,
-    folder: str | PathLike[str],
-) -> Bag:
-    anchors = encoder.on_site(bridged_site(site.site, simulated=site.simulated))
-    fixes: Counter[bool] = Counter()
-    start_s = end_s = 0.0
-    for found in source.messages(_KINDS):
-        start_s, end_s = start_s or found.time_s, found.time_s
-        for message in anchors:
-            writer.write(message, found.time_s)
-        anchors = []
-        if isinstance(found.message, FixMessage) and tag in (None, found.message.tag):
-            fixes[is_usable(found.message)] += 1
-        for message in _messages_of(found, encoder, tag):
-            writer.write(message, found.time_s)
-    summary = source.summary()
-    drops = {reason: count for reason, count in summary.drops.items() if count}
-    counts, types = writer.counts(), writer.types()
-    return Bag(str(folder), start_s, end_s, counts, types, fixes[True], fixes[False], drops, summary.finished)
-
-
-def _messages_of(found: Recorded, encoder: RosEncoder, tag: str | None) -> list[RosMessage]:
-    message = found.message
+def _messages_of(message: Struct, encoder: RosEncoder, tag: str | None) -> list[RosMessage]:
     if isinstance(message, SiteMessage):
         return encoder.on_site(bridged_site(message.site, simulated=message.simulated))
     if isinstance(message, FixMessage) and tag in (None, message.tag) and is_usable(message):
@@ -400,7 +393,7 @@ class _BagWriter:
         rosbag2 = extra_module("rosbags.rosbag2", "a bag of ROS 2")
         self._writer: Writer = rosbag2.Writer(folder, version=version, storage_plugin=rosbag2.StoragePlugin.MCAP)
         self._writer.set_compression(rosbag2.CompressionMode.STORAGE, rosbag2.CompressionFormat.ZSTD)
-        self._topics: dict[str, Connection] = {}
+        self.topics: dict[str, Connection] = {}
 
     def __enter__(self) -> "_BagWriter":
         self._writer.open()
@@ -413,9 +406,9 @@ class _BagWriter:
             self._writer.abort()
 
     def write(self, message: RosMessage, time_s: float) -> None:
-        topic = self._topics.get(message.topic)
+        topic = self.topics.get(message.topic)
         if topic is None:
-            topic = self._topics[message.topic] = self._writer.add_connection(
+            topic = self.topics[message.topic] = self._writer.add_connection(
                 message.topic,
                 message.type,
                 typestore=type_store(),
@@ -423,13 +416,9 @@ class _BagWriter:
             )
         self._writer.write(topic, round(time_s * NS), message.data)
 
-    def counts(self) -> dict[str, int]:
-        """Messages on each topic."""
-        return {name: self._writer.counts[topic.id] for name, topic in sorted(self._topics.items())}
-
-    def types(self) -> dict[str, str]:
-        """Type of each topic."""
-        return {name: topic.msgtype for name, topic in sorted(self._topics.items())}
+    def count(self, topic: "Connection") -> int:
+        """Messages that were written on a topic."""
+        return self._writer.counts[topic.id]
 
 
 def _quality(*, lasting: bool) -> "Qos":

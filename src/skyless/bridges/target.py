@@ -339,10 +339,9 @@ class Route(Struct):
 class Hub:
     """Distributes one site's messages to its targets."""
 
-    def __init__(self, routes: Sequence[Route], log: Callable[[str], None], table: SiteTable | None = None) -> None:
-        """``table``: a new one by default, in which messages can arrive."""
+    def __init__(self, routes: Sequence[Route], log: Callable[[str], None]) -> None:
         self.routes = tuple(routes)
-        self.table = SiteTable(-inf) if table is None else table
+        self.table = SiteTable(-inf)
         for route in self.routes:
             route.target.use(self.table)
         self.site: BridgedSite | None = None
@@ -365,7 +364,11 @@ class Hub:
         self.site = site
         reasons = []
         for route in self.routes:
-            before, route.refused = route.refused, _refusal(route.target, site)
+            before, route.refused = route.refused, ""
+            try:
+                route.target.on_site(site)
+            except SkylessError as error:
+                route.refused = str(error)
             if route.refused not in ("", before):
                 reasons.append(route.refused)
         if self.routes and all(route.refused for route in self.routes):
@@ -386,19 +389,18 @@ class Hub:
             return
         self.fixes += 1
         for route in self.routes:
-            if self._carries(route, fix.tag) and self._is_due(route, fix.tag, now_s):
+            if self._carries(route, fix.tag) and route.rates.setdefault(fix.tag, RateLimit(route.hz)).is_due(now_s):
                 self._guard(route, lambda target: target.on_fix(fix))
 
     def on_health(self, health: TagHealth | AnchorHealth, now_s: float) -> None:
         """Distribute the state of a tag or an anchor."""
+        tag = health.tag if isinstance(health, TagHealth) else None
         if isinstance(health, TagHealth):
             self._expect(health.tag, now_s, health.reason)
             self.table.add_health("tag", health.tag, health, now_s)
         else:
             self.table.add_health("anchor", str(health.anchor), health, now_s)
-        for route in self.routes:
-            if not isinstance(health, TagHealth) or route.tag in (None, health.tag):
-                self._guard(route, lambda target: target.on_health(health))
+        self._give(tag, lambda target: target.on_health(health))
 
     def _expect(self, tag: str, now_s: float, reason: str | None) -> None:
         """Note that a tag should have fixes, and why it has none."""
@@ -414,10 +416,8 @@ class Hub:
     def on_status(self, status: StatusMessage, now_s: float, unix_s: float) -> None:
         """A program of the site has connected or left."""
         if self.table.add_status(status, now_s) and status.kind == "tag":
-            self._give_gone(status.name, unix_s)
-        for route in self.routes:
-            if status.kind != "tag" or route.tag in (None, status.name):
-                self._guard(route, lambda target: target.on_status(status))
+            self._give(status.name, lambda target: target.on_gone(status.name, unix_s))
+        self._give(status.name if status.kind == "tag" else None, lambda target: target.on_status(status))
 
     def on_alarm(self, alarm: AlarmMessage) -> None:
         """Distribute an alarm's present state. A target with a selected tag gets those that concern it."""
@@ -428,7 +428,7 @@ class Hub:
     def on_tick(self, now_s: float, unix_s: float) -> None:
         """Report silent tags and seconds; call every ``SILENCE_CHECK_S``."""
         for name in self.table.tick(now_s):
-            self._give_gone(name, unix_s)
+            self._give(name, lambda target: target.on_gone(name, unix_s))  # noqa: B023 - called at once
         for name, reason in tuple(self._reasons.items()):
             tag = self.table.get("tag", name)
             if tag is None:
@@ -439,21 +439,16 @@ class Hub:
                 continue
             elif now_s >= self._due_s[name] and self.site is not None:
                 self._due_s[name] = now_s + _SECOND_S
-                self._give_no_fix(name, unix_s, reason)
+                self._give(name, lambda target: target.on_no_fix(name, unix_s, reason))  # noqa: B023 - see above
         if now_s - self._second_s >= _SECOND_S:
             self._second_s = now_s
-            for route in self.routes:
-                self._guard(route, lambda target: target.on_second(unix_s))
+            self._give(None, lambda target: target.on_second(unix_s))
 
-    def _give_gone(self, tag: str, unix_s: float) -> None:
+    def _give(self, tag: str | None, call: Callable[[Target], None]) -> None:
+        """Call the targets that get a tag, also those that carry one and wait for its first fix; for None all."""
         for route in self.routes:
-            if route.tag in (None, tag):
-                self._guard(route, lambda target: target.on_gone(tag, unix_s))
-
-    def _give_no_fix(self, tag: str, unix_s: float, reason: str) -> None:
-        for route in self.routes:
-            if route.tag in (None, tag):  # one that carries a single tag waits for a tag that has fixes
-                self._guard(route, lambda target: target.on_no_fix(tag, unix_s, reason))
+            if tag is None or route.tag in (None, tag):
+                self._guard(route, call)
 
     def _guard(self, route: Route, call: Callable[[Target], None]) -> None:
         """Call a target; a fault in it costs neither fixes nor other targets."""
@@ -465,12 +460,6 @@ class Hub:
             route.faults += 1
             if route.faults == 1:
                 self._log(f"{route.target.text} failed ({error!r}); it is logged once")
-
-    @staticmethod
-    def _is_due(route: Route, tag: str, now_s: float) -> bool:
-        if tag not in route.rates:
-            route.rates[tag] = RateLimit(route.hz)
-        return route.rates[tag].is_due(now_s)
 
     def _carries(self, route: Route, tag: str) -> bool:
         """Whether a target gets the fixes of a tag; one that carries only one keeps the first tag with a fix."""
@@ -491,12 +480,3 @@ def open_hub(routes: Sequence[Route], log: Callable[[str], None]) -> Hub:
         if texts.count(text) > 1:
             raise SkylessError(f"the target {text!r} is given twice; give it once")
     return Hub(routes, log)
-
-
-def _refusal(target: Target, site: BridgedSite) -> str:
-    """Why a target cannot serve a site; empty if it can."""
-    try:
-        target.on_site(site)
-    except SkylessError as error:
-        return str(error)
-    return ""

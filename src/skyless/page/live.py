@@ -148,7 +148,7 @@ class LiveSite:
         self.connected = False
         self.feed = SiteFeed(clock)
         self.table = SiteTable(clock(), platform.node(), connected=False, drops=self.feed.drops)
-        self.state = SiteState(self.table, self.feed.drops)
+        self.state = SiteState(self.table)
         self.monitor = ZoneMonitor()
         self.events = EventQueue()
         self.pages: set[PageQueue] = set()
@@ -158,7 +158,6 @@ class LiveSite:
         self.assets = SiteAssets(self._broadcast, assets_file)
         self.event_list = EventList()
         self.has_history, self._at_hub = has_history, at_hub
-        self.dropped = self.feed.drops
         self._clock, self.wall_clock = clock, wall_clock
         self._link: SiteLink | None = None
         self._site_id: int | None = None

@@ -13,12 +13,12 @@ from skyless.core.errors import SkylessError
 from skyless.core.method_names import DEFAULT_METHOD
 from skyless.core.site import Site
 from skyless.page.tasks import OverlayTask, serve_tasks
+from skyless.site.channel import ChannelModel
 from skyless.site.planning.colours import COLOUR_STOPS, scale_of
-from skyless.site.planning.links import FIX_SHARE, HDOP, PDOP, SIGMA
-from skyless.site.planning.maps import MAX_PREDICTED, Grid, PlanSettings, Predictor, plan_map
+from skyless.site.planning.links import FIX_SHARE, HDOP, PDOP, SIGMA, lowest_and_highest
+from skyless.site.planning.maps import MAX_PREDICTED, STEPS_M, Grid, Predictor, plan_map
 
 MAX_CELLS: Final = 40_000
-_STEPS_M: Final = (0.05, 0.1, 0.2, 0.25, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0)
 
 _MIN_FIX_SHARE: Final = 0.5
 
@@ -60,7 +60,7 @@ def _grids(task: bytes) -> tuple[Grid, dict[str, list[float | None]]]:
     if count < needed:
         raise SkylessError(f"a position needs {needed} anchors or more; this site has {count}")
     grid = grid_of(asked.site, asked.plan_px, asked.step_m)
-    table = plan_map(Predictor(asked.site, PlanSettings()), grid).table[0]
+    table = plan_map(Predictor(asked.site, ChannelModel()), grid).table[0]
     covered = table[..., FIX_SHARE] >= _MIN_FIX_SHARE
     return grid, {
         "pdop": _values(table[..., PDOP], 3),
@@ -81,13 +81,12 @@ def grid_of(site: Site, plan_px: tuple[int, int] | None, least_step_m: float) ->
         length_m = plan.width_m * plan_px[1] / plan_px[0]
         points += [(plan.x_m, plan.y_m), (plan.x_m + plan.width_m, plan.y_m + length_m)]
     low, high = np.min(points, axis=0), np.max(points, axis=0)
-    for step_m in (least_step_m, *(step_m for step_m in _STEPS_M if step_m > least_step_m)):
+    for step_m in (least_step_m, *(step_m for step_m in STEPS_M if step_m > least_step_m)):
         columns, rows = (max(1, -int(-length_m // step_m)) for length_m in high - low)
         if columns * rows <= MAX_CELLS:
             break
     xs, ys = (start + (np.arange(count) + 0.5) * step_m for start, count in zip(low, (columns, rows), strict=True))
-    heights_m = [anchor.z_m for anchor in site.anchors]
-    height_m = site.tags.height_m if site.tags.height_m is not None else (min(heights_m) + max(heights_m)) / 2
+    height_m = site.tags.height_m if site.tags.height_m is not None else sum(lowest_and_highest(site)) / 2
     return Grid(xs, ys, np.array([height_m]), step_m, np.ones((rows, columns), dtype=np.bool_))
 
 

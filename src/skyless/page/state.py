@@ -1,7 +1,7 @@
 """The state of the site for pages, gathered from messages, and the parts that are new to each page. No I/O."""
 
 import math
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable
 from itertools import islice
 from typing import Annotated, Any, Final, TypeVar
 
@@ -89,9 +89,8 @@ class Sent:
 class SiteState:
     """What pages get of a site's table: rows of tags, healths and statuses."""
 
-    def __init__(self, table: SiteTable, dropped: Mapping[str, int] | None = None) -> None:
-        """``dropped``: messages that could not be read, by kind, as counted by a feed."""
-        self.table, self.dropped = table, {} if dropped is None else dropped
+    def __init__(self, table: SiteTable) -> None:
+        self.table = table
         self.now_s = self.unix_s = 0.0
         """Times of the next messages, by the table's clock and by Unix time; set by the owner."""
         self._truths = TruthBuffer()
@@ -245,7 +244,7 @@ class SiteState:
                 "nodes": nodes,
                 "conditions": changed,
                 "waiting": self._waiting,
-                "dropped": self.dropped,
+                "dropped": table.drops,
                 "ages": ages,
             },
         )

@@ -72,7 +72,7 @@ def verify(
     predictor: Predictor, points_m: Matrix, rounds: int, seed: int, progress: Callable[[float], None] | None = None
 ) -> Verification:
     """Let a tag rest at each point, shape (m, 3), for ``rounds`` superframes, and compare."""
-    site, settings = predictor.site, predictor.settings
+    site = predictor.site
     superframe_s = period_s(site)
     worlds = 1 if site.accuracy.is_exact else _WORLDS
     rounds = max(rounds // worlds, 1)
@@ -84,7 +84,7 @@ def verify(
         slope_m = site.accuracy.slope_std_m * (-1.0) ** world  # one for all ranges: with both signs in turn
         room = None if worlds == 1 else stated_room(site, slope_m=slope_m, at_rest=True)
         request = Request(site=site, seed=seed + world, room=room)
-        impairments = replace(impairments_of(request, site), channel=settings.channel)
+        impairments = replace(impairments_of(request, site), channel=predictor.channel)
         fleet = Fleet(site, still, impairments, request.seed, FleetSettings(warmup_s=warm_up_s))
         now_s = 0.0
         while now_s < end_s:

@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, Generic, TypeVar, cast
 
 import numpy as np
+from msgspec.structs import replace
 
 from skyless.arguments import check_choice, check_whole, python_function
 from skyless.cli.api.fixes import Result, data_frame
@@ -33,7 +34,6 @@ from skyless.site.planning.links import (
 from skyless.site.planning.maps import (
     MAX_PREDICTED,
     PlanMap,
-    PlanSettings,
     Predictor,
     grid_of,
     plan_map,
@@ -293,7 +293,8 @@ def run_plan(asked: PlanOptions) -> PlanResult | RatePlanResult:
         return rates
     asked.leave_out("exponent", why=f"it is for sites of more than {MAX_PREDICTED} anchors")
     channel = ChannelModel() if asked.range_m is None else with_range(ChannelModel(), asked.range_m)
-    settings = PlanSettings(asked.noise_ps, channel)
+    if asked.noise_ps is not None:
+        site = replace(site, noise=replace(site.noise, tx_stamp_ps=asked.noise_ps, rx_stamp_ps=asked.noise_ps))
     if asked.optimise is None:
         check_anchor_count(site, file)
     else:
@@ -303,10 +304,10 @@ def run_plan(asked: PlanOptions) -> PlanResult | RatePlanResult:
     mounts = mounts_of(site, floor, walls_m, None if asked.anchor_heights_m is None else tuple(asked.anchor_heights_m))
     optimised: Optimised | None = None
     if asked.optimise is not None:
-        search = Search(site, settings, floor, mounts, heights_m, asked.optimise, asked.seed, asked.search_s)
+        search = Search(site, channel, floor, mounts, heights_m, asked.optimise, asked.seed, asked.search_s)
         optimised = search.run(asked.target_m, asked.progress)
         site = optimised.best.site
-    predictor = Predictor(site, settings)
+    predictor = Predictor(site, channel)
     try:
         grid = grid_of(floor, heights_m, asked.step_m)
     except ValueError as error:

@@ -101,12 +101,17 @@ def doctor(*, asked: DoctorOptions, live: SiteOptions, output: JsonOptions) -> i
     run(work())
     if not checks:
         return 1
-    failed = sum(one.result == "failed" for one in checks)
     title = f"skyless doctor {installed_version()}, {platform.node()}, {time.strftime('%Y-%m-%d %H:%M')}"
     about = f"Python {platform.python_version()} on {platform.platform()}. {EMULATED}"
     text = report_text(title, about, checks)
     if report is not None:
         write_file(report, text.encode())
+    return show_checks(checks, text, report, output)
+
+
+def show_checks(checks: Sequence[Check], text: str, report: Path | None, output: JsonOptions) -> int:
+    """Print checks, or their report as text. Returns the exit code."""
+    failed = sum(one.result == "failed" for one in checks)
     if output.json:
         print_json({"checks": checks, "failed": failed, "report": report})
     else:

@@ -11,12 +11,11 @@ from skyless.cli.common import (
     check_folder,
     check_new,
     command,
-    print_json,
     say_written,
     to_json,
     write_file,
 )
-from skyless.cli.nodes.doctor import EMULATED, report_text
+from skyless.cli.nodes.doctor import EMULATED, report_text, show_checks
 from skyless.cli.nodes.options import log
 from skyless.core.errors import SkylessError
 from skyless.radio.serial.serial_port import check_path
@@ -92,16 +91,12 @@ def _test(asked: SelftestOptions, output: JsonOptions) -> int:
 
 def _show(report: Report, file: Path | None, output: JsonOptions) -> int:
     """Print what a report means before it is written, as the disk may be full. Returns the exit code."""
-    checks = judge(report)
-    failed = sum(one.result == "failed" for one in checks)
-    if output.json:
-        print_json({"checks": checks, "failed": failed, "report": file})
-    else:
-        print(report_text(f"skyless selftest {report.skyless_version}, {report.made}", EMULATED, checks), end="")
+    checks, title = judge(report), f"skyless selftest {report.skyless_version}, {report.made}"
+    code = show_checks(checks, report_text(title, EMULATED, checks), file, output)
     if file is not None:
         write_file(file, to_json(report).encode())
         say_written(file)
-    return 1 if failed else 0
+    return code
 
 
 def _load(path: Path) -> Report:

@@ -3,7 +3,6 @@
 import asyncio
 import os
 import queue
-import re
 import sys
 import threading
 import time
@@ -18,6 +17,7 @@ from msgspec.structs import replace
 from skyless.arguments import Method, NotNegative, Options, Text, number, read_height
 from skyless.bridges.motion_feed import MotionFeed
 from skyless.bridges.program import TagBridge, heard_site
+from skyless.bridges.target import TAG_NAME
 from skyless.cli.common import cm, command, to_json
 from skyless.cli.nodes.bridge import hub_of
 from skyless.cli.nodes.options import MqttOptions, SiteId, log, run_until_stopped
@@ -185,8 +185,6 @@ def _standard_output() -> TextIO:
     return os.fdopen(os.dup(sys.stdout.fileno()), "w", 1, sys.stdout.encoding, "backslashreplace")
 
 
-_TAG_NAME: Final = re.compile(r"[A-Za-z0-9_-]{1,32}")
-
 _OF_BOARDS: Final = (
     *("method", "tag_height_std", "site_id", "site_key", "trust", "clock_bound_ms", "integrity_risk", "alert_limit_m"),
 )
@@ -255,7 +253,7 @@ def tag(*names: _Names, asked: TagOptions, broker: MqttOptions, shown: LineOptio
     --csv or --json it writes the same fixes on standard output.
     """
     address, lines = broker.address(), shown.lines(log, addresses=driver_of(asked.radio) in STATED_POSITIONS)
-    if not names or len(set(names)) < len(names) or not all(map(_TAG_NAME.fullmatch, names)):
+    if not names or len(set(names)) < len(names) or not all(map(TAG_NAME.fullmatch, names)):
         given = repr(" ".join(names)) if names else "missing"
         raise SkylessError(
             f"NAMES is {given}; it should be one or more names, each once, of 1 to 32 letters, digits, - or _"
@@ -361,7 +359,7 @@ def _on_sniffers(
         log,
         simulated=lambda: is_simulated(asked.radio),
         on_fix=on_fix,
-        on_health=None if bridge is None else bridge.on_system_health,
+        on_health=None if bridge is None else bridge.on_health,
         on_anchors=on_anchors,
     )
     return tags, tags.nodes[0]

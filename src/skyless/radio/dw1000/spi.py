@@ -192,7 +192,10 @@ class SpiPort:
         """Serve the chip while its line is high after a rise; a line without events is polled instead."""
         vain = 0
         while True:
-            is_high = await _is_set(risen, _LINE_CHECK_S)
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(_LINE_CHECK_S):
+                    await risen.wait()
+            is_high = risen.is_set()
             bus.forget_edges()
             risen.clear()
             while True:
@@ -205,13 +208,6 @@ class SpiPort:
                 if not is_high:
                     break
                 await asyncio.sleep(0)
-
-
-async def _is_set(event: asyncio.Event, seconds: float) -> bool:
-    with contextlib.suppress(TimeoutError):
-        async with asyncio.timeout(seconds):
-            await event.wait()
-    return event.is_set()
 
 
 def check_spi(spec: str, bus: int, device: int, gpio_chip: str | None) -> None:

@@ -1,7 +1,7 @@
 """Bitcraze's loco positioning system: payloads of its anchors, and streams of its sniffers."""
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from io import BufferedIOBase
 from math import isfinite
 from struct import Struct as Layout
@@ -109,26 +109,21 @@ def recognise_text(head: bytes) -> bool:
 
 def read_text(stream: BufferedIOBase, drops: Drops) -> Iterator[Packet]:
     """Yield the packets of a text stream."""
-    for line in lines(stream, drops):
-        packet = packet_of_line(line, drops)
-        if packet is not None:
+    return packets_of_lines(lines(stream, drops), drops)
+
+
+def packets_of_lines(text: Iterable[bytes], drops: Drops) -> Iterator[Packet]:
+    """Yield the packets of lines; those that are none are counted in ``drops``."""
+    for line in filter(None, text):
+        match = _LINE.fullmatch(line)
+        packet: Packet | str = "malformed-line"
+        if match is not None:
+            sender, stamp, payload = match.groups()
+            packet = decode_payload(bytes.fromhex(payload.decode()), None, int(sender, 16), int(stamp, 16))
+        if isinstance(packet, Packet):
             yield packet
-
-
-def packet_of_line(line: bytes, drops: Drops) -> Packet | None:
-    """Decode a line to a packet; None, counted in ``drops``, if it is none."""
-    if not line:
-        return None
-    match = _LINE.fullmatch(line)
-    if match is None:
-        drops["malformed-line"] += 1
-        return None
-    sender, stamp, payload = match.groups()
-    packet = decode_payload(bytes.fromhex(payload.decode()), None, int(sender, 16), int(stamp, 16))
-    if isinstance(packet, Packet):
-        return packet
-    drops[packet] += 1
-    return None
+        else:
+            drops[packet] += 1
 
 
 # Binary stream of Bitcraze's sniffer (after ``b`` was sent to it); reading resumes after garbage.

@@ -30,22 +30,23 @@ _MESSAGES: Final = frozenset(map(int, DtMessageType))
 
 
 class DtTag:
-    """Converts a tag's notifications to packets, and counts unusable ones."""
+    """Converts a tag's stream of notifications to packets, and counts unusable ones."""
 
     def __init__(self, drops: Drops, frame: AnchorFrame) -> None:
         self._drops = drops
-        self._rounds = DtRounds(frame)
+        self._reader, self._rounds = UciReader(drops), DtRounds(frame)
 
-    def on_uci(self, packet: UciPacket, host_s: float | None = None) -> list[Packet]:
-        """Packets of a notification in order of reception; ``host_s``: its arrival."""
-        info = decode_session_info(packet)
-        if isinstance(info, SessionInfo):
-            return self.on_info(info, host_s)
-        self._drops[info] += 1
-        return []
+    def feed(self, data: bytes, host_s: float | None = None) -> Iterator[Packet]:
+        """Packets of the notifications that this piece completes; ``host_s``: its arrival."""
+        for packet in self._reader.feed(data):
+            info = decode_session_info(packet)
+            if isinstance(info, SessionInfo):
+                yield from self.on_info(info, host_s)
+            else:
+                self._drops[info] += 1
 
     def on_info(self, info: SessionInfo, host_s: float | None = None) -> list[Packet]:
-        """Packets of a decoded notification."""
+        """Packets of a decoded notification in order of reception."""
         reasons = [_unusable(one) for one in info.measurements]
         self._drops.update(filter(None, reasons))
         usable = [one for one, reason in zip(info.measurements, reasons, strict=True) if reason is None]
@@ -104,10 +105,9 @@ def _has_measurements(packets: list[UciPacket]) -> bool:
 
 def read_binary(stream: BufferedIOBase, drops: Drops, anchors_m: Mapping[int, Point] | None = None) -> Iterator[Packet]:
     """Yield the packets of a binary log; ``anchors_m``: positions that replace those stated by anchors."""
-    reader, tag = UciReader(drops), DtTag(drops, AnchorFrame(anchors_m))
+    tag = DtTag(drops, AnchorFrame(anchors_m))
     for chunk in chunks(stream, drops):
-        for packet in reader.feed(chunk):
-            yield from tag.on_uci(packet)
+        yield from tag.feed(chunk)
 
 
 PCAPNG_MAGIC: Final = b"\x0a\x0d\x0d\x0a"
@@ -127,12 +127,10 @@ def recognise_pcapng(head: bytes) -> bool:
 
 def read_pcapng(stream: BufferedIOBase, drops: Drops, anchors_m: Mapping[int, Point] | None = None) -> Iterator[Packet]:
     """Yield the packets of a capture of UCI."""
-    reader, tag = UciReader(drops), DtTag(drops, AnchorFrame(anchors_m))
+    tag = DtTag(drops, AnchorFrame(anchors_m))
     for kind, body, order in _blocks(chunks(stream, drops), drops):
         if kind == _PACKET and len(body) >= 20:
-            length = int.from_bytes(body[12:16], order)
-            for packet in reader.feed(body[20 : 20 + length]):
-                yield from tag.on_uci(packet)
+            yield from tag.feed(body[20 : 20 + int.from_bytes(body[12:16], order)])
 
 
 def _blocks(pieces: Iterator[bytes], drops: Drops) -> Iterator[tuple[int, bytes, Literal["little", "big"]]]:
@@ -158,14 +156,13 @@ def _blocks(pieces: Iterator[bytes], drops: Drops) -> Iterator[tuple[int, bytes,
 
 def read_text(stream: BufferedIOBase, drops: Drops, anchors_m: Mapping[int, Point] | None = None) -> Iterator[Packet]:
     """Yield the packets of a text log; lines without a packet are counted."""
-    reader, tag = UciReader(drops), DtTag(drops, AnchorFrame(anchors_m))
+    tag = DtTag(drops, AnchorFrame(anchors_m))
     for line in lines(stream, drops):
         found = _packets_of_line(line)
         if not found and line.strip():
             drops["line-without-notification"] += 1
         for data in found:
-            for packet in reader.feed(data):
-                yield from tag.on_uci(packet)
+            yield from tag.feed(data)
 
 
 def _packets_of_line(line: bytes) -> list[bytes]:

@@ -13,9 +13,9 @@ from skyless.core.air.frame import MAX_FRAME_BYTES, Diagnostics, Reception, Tran
 from skyless.core.air.masterless_packets import Packet
 from skyless.core.ticks import wrap
 from skyless.files import Drops, LineCutter
-from skyless.radio.foreign.bitcraze import BinaryCutter, packet_of_line, recognise_binary, recognise_text
+from skyless.radio.foreign.bitcraze import BinaryCutter, packets_of_lines, recognise_binary, recognise_text
 from skyless.radio.foreign.fira import DtTag
-from skyless.radio.foreign.uci import AnchorFrame, UciReader
+from skyless.radio.foreign.uci import AnchorFrame
 from skyless.radio.interface import Gone, Late, RadioEvent, Restarted, ignore
 from skyless.radio.serial.serial_port import BoardClock, SerialPort, line_advice
 
@@ -153,14 +153,13 @@ class UciRadio(_ListeningBoard[Packet]):
     def __init__(self, path: str, baud: int, name: str, frame: AnchorFrame) -> None:
         super().__init__(path, baud, name)
         self.frame = frame
-        self._reader, self._tag = UciReader(self.counters), DtTag(self.counters, frame)
+        self._tag = DtTag(self.counters, frame)
 
     def _start(self, send: Callable[[bytes], None]) -> None:  # noqa: ARG002 - it is sent nothing
-        self._reader, self._tag = UciReader(self.counters), DtTag(self.counters, self.frame)
+        self._tag = DtTag(self.counters, self.frame)
 
     def _events(self, data: bytes, host_s: float) -> Iterator[Packet]:
-        for packet in self._reader.feed(data):
-            yield from self._tag.on_uci(packet, host_s)
+        return self._tag.feed(data, host_s)
 
 
 class SnifferStream:
@@ -203,13 +202,9 @@ class SnifferStream:
         return b""
 
     def _packets(self, data: bytes) -> Iterator[Packet]:
-        if not self._is_text:
-            yield from self._binary.feed(data)
-            return
-        for line in self._lines.feed(data):
-            packet = packet_of_line(line, self._drops)
-            if packet is not None:
-                yield packet
+        if self._is_text:
+            return packets_of_lines(self._lines.feed(data), self._drops)
+        return self._binary.feed(data)
 
 
 # Lines of the uwb-apps listener (Mynewt): one JSON object for each frame, as it was received.

@@ -37,11 +37,11 @@ bytes serve our tests, and Qorvo's client for QM35. The specification itself is 
 """
 
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from enum import IntEnum
 from math import dist
 from struct import Struct as Layout
-from typing import Final
+from typing import Final, TypeAlias
 
 from msgspec import Struct
 
@@ -135,16 +135,14 @@ class UciReader:
             self._segments.clear()
         self._begun = key
         self._segments += segment[CONTROL_HEADER_BYTES:]
-        if len(self._segments) > MAX_UCI_PAYLOAD_BYTES:
-            self._drops["overlong-packet"] += 1
-            self._begun = None
-            self._segments.clear()
+        is_overlong = len(self._segments) > MAX_UCI_PAYLOAD_BYTES
+        if segment[0] & 0x10 and not is_overlong:
             return None
-        if segment[0] & 0x10:
-            return None
-        payload = bytes(self._segments)
-        self._begun = None
+        payload, self._begun = bytes(self._segments), None
         self._segments.clear()
+        if is_overlong:
+            self._drops["overlong-packet"] += 1
+            return None
         return UciPacket(UciType(kind), key[1], opcode, payload)
 
 
@@ -264,9 +262,9 @@ def decode_session_info(packet: UciPacket) -> SessionInfo | str:
     if wide > 1:
         return "impossible-address-mode"
     address_bytes, version = 8 if wide else 2, 1
-    found, exact = (None, False) if kind == _DL_TDOA_2 else _decode_all_1(payload, address_bytes, count)
+    found, exact = (None, False) if kind == _DL_TDOA_2 else _decode_all(_decode_1, payload, address_bytes, count)
     if not exact:
-        second, fits = _decode_all_2(payload, address_bytes, count)
+        second, fits = _decode_all(_decode_sized_2, payload, address_bytes, count)
         if second is not None and (fits or found is None):
             found, version = second, 2
     if found is None:
@@ -274,31 +272,31 @@ def decode_session_info(packet: UciPacket) -> SessionInfo | str:
     return SessionInfo(sequence, session, version, found, bool(wide))
 
 
-def _decode_all_1(payload: bytes, address_bytes: int, count: int) -> tuple[tuple[DtMeasurement, ...] | None, bool]:
-    """Measurements of version 1, and whether they end where the notification does."""
+_Decoded = tuple[DtMeasurement, int] | None
+"""A measurement and its end; None if it does not fit."""
+
+
+def _decode_all(
+    decode: Callable[[bytes, int, int], _Decoded], payload: bytes, address_bytes: int, count: int
+) -> tuple[tuple[DtMeasurement, ...] | None, bool]:
+    """Measurements of a version, and whether they end where the notification does."""
     at, found = _INFO.size, []
     for _ in range(count):
-        one = _decode_1(payload, at, address_bytes)
-        if one is None:
+        if (one := decode(payload, at, address_bytes)) is None:
             return None, False
-        found.append(one[0])
-        at = one[1]
+        measurement, at = one
+        found.append(measurement)
     return tuple(found), at == len(payload)
 
 
-def _decode_all_2(payload: bytes, address_bytes: int, count: int) -> tuple[tuple[DtMeasurement, ...] | None, bool]:
-    at, found = _INFO.size, []
-    for _ in range(count):
-        size = int.from_bytes(payload[at : at + 2], "little")
-        one = _decode_2(payload, at, address_bytes, 4)
-        if one is None or one[1] != at + size:
-            other = _decode_2(payload, at, address_bytes, 2)
-            one = other if other is not None and (one is None or other[1] == at + size) else one
-        if one is None or size < 2 or at + size > len(payload):  # published measurements end behind their size
-            return None, False
-        found.append(one[0])
-        at += size
-    return tuple(found), at == len(payload)
+def _decode_sized_2(payload: bytes, at: int, address_bytes: int) -> _Decoded:
+    """A measurement of version 2 up to its stated size; the fields of published ones end before that."""
+    end = at + int.from_bytes(payload[at : at + 2], "little")
+    one = _decode_2(payload, at, address_bytes, 4)
+    if one is None or one[1] != end:
+        other = _decode_2(payload, at, address_bytes, 2)
+        one = other if other is not None and (one is None or other[1] == end) else one
+    return None if one is None or not at + 2 <= end <= len(payload) else (one[0], end)
 
 
 def _encode_1(one: DtMeasurement, address: bytes) -> bytes:
@@ -313,8 +311,8 @@ def _encode_1(one: DtMeasurement, address: bytes) -> bytes:
     return address + head + stamps + _times(one) + one.location
 
 
-def _decode_1(payload: bytes, at: int, address_bytes: int) -> tuple[DtMeasurement, int] | None:
-    """A measurement of version 1 and its end; None if it does not fit."""
+def _decode_1(payload: bytes, at: int, address_bytes: int) -> _Decoded:
+    """A measurement of version 1."""
     head_at, size = at + address_bytes, len(payload)
     if head_at + _HEAD_1.size > size:
         return None
@@ -354,8 +352,8 @@ def _encode_2(one: DtMeasurement, address: bytes) -> bytes:
     return _whole(len(body) + 2, 2) + body
 
 
-def _decode_2(payload: bytes, at: int, address_bytes: int, control_bytes: int) -> tuple[DtMeasurement, int] | None:
-    """A measurement of version 2 and the end of its fields; None if they do not fit."""
+def _decode_2(payload: bytes, at: int, address_bytes: int, control_bytes: int) -> _Decoded:
+    """A measurement of version 2, and the end of its fields."""
     head_at = at + 2 + address_bytes
     times_at = head_at + _HEAD_2.size
     if times_at + _TIMES.size > len(payload):
@@ -437,13 +435,8 @@ def _counted_at(payload: bytes, at: int) -> tuple[bytes, int]:
 # Locations
 
 
-class GeodeticPoint(Struct, frozen=True, gc=False):
-    """A point in WGS 84."""
-
-    latitude_deg: float
-    longitude_deg: float
-    height_m: float
-
+GeodeticPoint: TypeAlias = GeoreferenceSite
+"""A point in WGS 84, which may become a site's origin."""
 
 _WGS84_BITS: Final = (33, 33, 30)
 _RELATIVE_BITS: Final = (28, 28, 24)
@@ -604,8 +597,7 @@ class AnchorFrame:
             if self._is_relative:
                 return None
             self.origin = self.origin or location
-            origin = GeoreferenceSite(self.origin.latitude_deg, self.origin.longitude_deg, self.origin.height_m)
-            return east_north_up_of(location.latitude_deg, location.longitude_deg, location.height_m, origin)
+            return east_north_up_of(location.latitude_deg, location.longitude_deg, location.height_m, self.origin)
         if location is None or self.origin is not None:
             return None
         self._is_relative = True

@@ -14,7 +14,7 @@ from typing import Final
 from msgspec import Struct
 from msgspec.structs import astuple
 
-from skyless.core.air.frame import Diagnostics
+from skyless.core.air.frame import Diagnostics, Reception
 from skyless.core.ticks import DEFAULT_ANTENNA_DELAY_TICKS
 from skyless.radio.tag_reports import BODY_AT, TagReport, anchor_place, board_fix, board_status, georeference
 
@@ -68,12 +68,12 @@ class BoardSettings(Struct, frozen=True):
 def pack(settings: BoardSettings) -> bytes:
     """Encode settings. Raises struct.error for values that do not fit."""
     words = _WORDS.pack(VERSION, *astuple(settings))
-    return words + crc_hqx(words, 0xFFFF).to_bytes(2, "big")
+    return words + crc16(words).to_bytes(2, "big")
 
 
 def unpack(data: bytes) -> BoardSettings | None:
     """Decode settings; None for bytes that no board of this version sends."""
-    if len(data) != SETTINGS_BYTES or crc_hqx(data, 0xFFFF) != 0:
+    if len(data) != SETTINGS_BYTES or crc16(data) != 0:
         return None
     version, *words = _WORDS.unpack_from(data)
     made = BoardSettings(*words[:-3], *(float(f"{single:.7g}") for single in words[-3:]))
@@ -368,15 +368,6 @@ class Hello(Struct, frozen=True):
     can_compute: bool = False
 
 
-class Heard(Struct, frozen=True, gc=False):
-    """A frame that the board received."""
-
-    rx_ticks: int
-    diagnostics: Diagnostics
-    frame: bytes
-    carrier_phase_cycles: float | None = None
-
-
 class Done(Struct, frozen=True, gc=False):
     """A frame was sent."""
 
@@ -443,7 +434,8 @@ class TagConfig(Struct, frozen=True):
     in_flash: bool
 
 
-Record = Hello | Heard | Done | TooLate | Status | NotDone | Value | Test | TagConfig | TagReport
+Record = Hello | Reception | Done | TooLate | Status | NotDone | Value | Test | TagConfig | TagReport
+"""A reception has no time of the host yet."""
 
 
 def decode(record: bytes) -> Record | str:
@@ -512,17 +504,18 @@ def _hello(record: bytes) -> Hello:
     )
 
 
-def _heard(record: bytes) -> Heard | None:
+def _heard(record: bytes) -> Reception | None:
     if not 1 <= len(record) - RX_FRAME_AT <= MAX_FRAME_BYTES:
         return None
-    return Heard(_ticks(record), from_steps(*struct.unpack_from("<3h", record, 7)), record[RX_FRAME_AT:])
+    measured = from_steps(*struct.unpack_from("<3h", record, 7))
+    return Reception(record[RX_FRAME_AT:], _ticks(record), None, measured)
 
 
-def _heard_with_phase(record: bytes) -> Heard | None:
+def _heard_with_phase(record: bytes) -> Reception | None:
     if not 1 <= len(record) - RX_PHASE_FRAME_AT <= MAX_FRAME_BYTES:
         return None
     *measured, phase = struct.unpack_from("<3hH", record, 7)
-    return Heard(_ticks(record), from_steps(*measured), record[RX_PHASE_FRAME_AT:], cycles(phase))
+    return Reception(record[RX_PHASE_FRAME_AT:], _ticks(record), None, from_steps(*measured), cycles(phase))
 
 
 def _done(record: bytes) -> Done | None:

@@ -30,7 +30,6 @@ from skyless.radio.serial.link import (
     MODES,
     OUTPUTS,
     Done,
-    Heard,
     Hello,
     NotDone,
     Record,
@@ -178,7 +177,8 @@ class LinkSession:
         self._refused = self._reported = ""
         self._heard_s = self._asked_s = self._status_s = 0.0
         self._starts: deque[float] = deque(maxlen=_MAX_STARTS)
-        self._reported_starts = self._reported_idle = self._reported_line = self._reported_full = False
+        self._hinted: set[str] = set()
+        """Subjects of the hints that have been given."""
         self._idle_polls = 0
 
     def begin(self, host_s: float) -> None:
@@ -204,11 +204,15 @@ class LinkSession:
         else:
             self._configure()
             self._idle_polls += 1
-            if self._idle_polls * STATUS_S >= _IDLE_S and not self._reported_idle:
-                self._reported_idle = True
-                text = f"the board at {self._port} answers, but does not start to receive: does its radio work?"
-                self._listener(Hint(text))
+            if self._idle_polls * STATUS_S >= _IDLE_S:
+                why = f"the board at {self._port} answers, but does not start to receive: does its radio work?"
+                self._hint_once("idle", why)
         return None
+
+    def _hint_once(self, subject: str, text: str) -> None:
+        if subject not in self._hinted:
+            self._hinted.add(subject)
+            self._listener(Hint(text))
 
     def _ask_hello(self, host_s: float) -> None:
         self._asked_s = host_s
@@ -278,12 +282,10 @@ class LinkSession:
             self.counters[reason] += times
 
     def _process(self, record: Record, host_s: float) -> None:
-        if isinstance(record, Heard):
+        if isinstance(record, Reception):
             if self.ready:
                 self.clock.update(record.rx_ticks, host_s)
-                self._listener(
-                    Reception(record.frame, record.rx_ticks, host_s, record.diagnostics, record.carrier_phase_cycles)
-                )
+                self._listener(replace(record, host_s=host_s))
         elif isinstance(record, Done):
             self._on_sent(record)
         elif isinstance(record, TooLate):
@@ -349,13 +351,13 @@ class LinkSession:
         self._idle_polls = 0
         starts = self._starts
         if starts and host_s - starts[-1] > _MAX_STARTS_S:
-            self._reported_starts = False
+            self._hinted.discard("starts")
         starts.append(host_s)
         within_s = host_s - starts[0]
-        if len(starts) == _MAX_STARTS and within_s <= _MAX_STARTS_S and not self._reported_starts:
-            self._reported_starts = True
+        if len(starts) == _MAX_STARTS and within_s <= _MAX_STARTS_S:
             often = f"starts again and again ({_MAX_STARTS} times within {within_s:.0f} s{_last_cause(cause)})"
-            self._listener(Hint(f"the board at {self._port} {often}: is its supply good, does its firmware fail?"))
+            why = f"the board at {self._port} {often}: is its supply good, does its firmware fail?"
+            self._hint_once("starts", why)
 
     def _refuse(self, reason: str) -> None:
         """Report a reason once until the board is ready, as a board that is asked again refuses again."""
@@ -398,7 +400,8 @@ class LinkSession:
 
     def _begin_to_report(self) -> None:
         self.ready, self._reported = True, ""
-        self._idle_polls, self._reported_idle = 0, False
+        self._idle_polls = 0
+        self._hinted.discard("idle")
         self._listener(Restarted())
 
     def _on_status(self, status: Status, host_s: float) -> None:
@@ -428,24 +431,22 @@ class LinkSession:
         """Records without room on the line are missing like spoilt ones; report once that it is full."""
         line = self.line
         line.settle(records)
-        if not self._reported_full and line.unsent > NOTABLE_SHARE * (line.intact + line.unsent) + _MIN_SPOILT:
-            self._reported_full = True
+        if line.unsent > NOTABLE_SHARE * (line.intact + line.unsent) + _MIN_SPOILT:
             advice = "fewer beacons (skyless site new --board dwm1001-dev), or a higher rate (skyless flash-config)"
-            self._listener(Hint(f"the line from the board at {self._port} is full, and records are left out: {advice}"))
+            self._hint_once(
+                "full", f"the line from the board at {self._port} is full, and records are left out: {advice}"
+            )
 
     def _check_line(self, status: Status, *, was_polled: bool) -> None:
         """Count when the board starts to poll its radio, and report it once."""
         if not status.polled or was_polled:
             return
         self.counters["interrupt-line-stuck"] += 1
-        if not self._reported_line:
-            self._reported_line = True
-            self._listener(
-                Hint(
-                    f"the interrupt line of the radio on the board at {self._port} does not follow its events; the "
-                    "board polls it, and receptions may come late: is the module sound (on a DWM1001 its GPIO 19)?"
-                )
-            )
+        self._hint_once(
+            "interrupt-line",
+            f"the interrupt line of the radio on the board at {self._port} does not follow its events; the "
+            "board polls it, and receptions may come late: is the module sound (on a DWM1001 its GPIO 19)?",
+        )
 
     def _reset(self) -> None:
         self.ready = False

@@ -262,8 +262,7 @@ class PacketTags:
             return
         self._heard_m = heard_m
         radio = self.nodes[0].radio
-        known = radio.frame.origin if isinstance(radio, UciRadio | PhoneRadio) else None
-        origin = None if known is None else GeoreferenceSite(*structs.astuple(known))
+        origin = radio.frame.origin if isinstance(radio, UciRadio | PhoneRadio) else None
         if self._on_anchors is not None:
             self._on_anchors(heard_m, origin)
         site = site_of(self._settings, heard_m, origin)

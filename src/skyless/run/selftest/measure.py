@@ -10,7 +10,7 @@ from typing import Any, Final, TypeVar
 from msgspec import Struct
 from msgspec.structs import replace
 
-from skyless.core.air.frame import fcs
+from skyless.core.air.frame import Diagnostics, Reception, fcs
 from skyless.core.ticks import (
     DEFAULT_ANTENNA_DELAY_TICKS,
     DELAYED_TX_GRANULARITY_TICKS,
@@ -116,7 +116,7 @@ class Bench:
             record = link.decode(raw)
             if isinstance(record, link.Test):
                 self._tests[record.length] += 1
-            elif isinstance(record, link.Heard):
+            elif isinstance(record, Reception):
                 self._hear(record)
             elif isinstance(record, link.Done | link.TooLate):
                 self._end_sending(record)
@@ -125,10 +125,13 @@ class Bench:
             if self._answer is not None and isinstance(record, self._wanted) and not self._answer.done():
                 self._answer.set_result(record)
 
-    def _hear(self, record: link.Heard) -> None:
+    def _hear(self, record: Reception) -> None:
         self._clock.update(record.rx_ticks, time.monotonic())
         if record.frame.startswith(_FRAME):
-            number, measured = int.from_bytes(record.frame[len(_FRAME) :][:4], "little"), record.diagnostics
+            number, measured = (
+                int.from_bytes(record.frame[len(_FRAME) :][:4], "little"),
+                record.diagnostics or Diagnostics(),
+            )
             heard = Heard(number, record.rx_ticks, measured.rx_power_dbm, measured.carrier_offset_ppm)
             self.facts.heard.append(heard)
 

@@ -14,7 +14,6 @@ from typing import Any, Final
 
 import numpy as np
 from msgspec import Struct
-from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from skyless.core.air.site_pages import encode_page
@@ -53,7 +52,7 @@ from skyless.site.planning.links import (
     master_links,
     weighted_pdop,
 )
-from skyless.site.planning.superframe import Relays, Superframe, relays_of, row_of_master, superframe_of
+from skyless.site.planning.superframe import relays_of, row_of_master, superframe_of
 
 # Predicted errors of ``joint``, from the estimator's covariance at points of a site: at rest, and after a walk.
 
@@ -73,85 +72,9 @@ _find_steady_state = compiled(steady_state.find_steady_state)
 _find_walked = compiled(steady_state.find_walked)
 
 
-def fill_joint_sigma(
-    points: Matrix,
-    settings: EstimatorSettings,
-    scene: Scene,
-    superframe: Superframe,
-    relays: Relays,
-    farthest_m: float,
-    table: Matrix,
-) -> None:
-    """Fill ``table`` (points, columns) with errors of ``joint`` at points, shape (m, 3).
-
-    There is no fix where the standard deviation would exceed ``farthest_m``.
-    """
-    shares, delays_m = scene.heard_at(points)
-    fill_dops(scene, points, shares, settings.dim, table)
-    table[:, SIGMA:], table[:, FIX_SHARE] = math.inf, 0.0
-    for row, point, share, delay_m in zip(table, points, shares, delays_m, strict=True):
-        rows = anchors_in_use(scene, point, share)
-        if len(rows) <= settings.dim:
-            continue
-        found = _steady_state(_state_at(settings, scene.anchors, rows, point), superframe, relays, share, delay_m, rows)
-        claimed_m2 = view(found.variance_m2) / found.fixes
-        variance_m2 = np.maximum(claimed_m2 - view(found.motion_m2), 0.0)
-        sigma_m = math.sqrt(variance_m2.sum())
-        if not sigma_m < farthest_m:
-            continue
-        row[SIGMA], row[SIGMA_X : SIGMA_Z + 1] = sigma_m, np.sqrt(variance_m2)
-        row[BIAS] = math.sqrt(found.square_bias_m2 / found.fixes)
-        row[RMSE] = math.hypot(sigma_m, row[BIAS])
-        row[FIX_SHARE] = found.fixes / np.isin(superframe.sender, rows).sum()
-        row[CLAIMED] = math.sqrt(claimed_m2.sum())
-
-
 def anchors_in_use(scene: Scene, point: Vector, share: Vector) -> Integers:
     """Rows of the anchors that a tag at a point uses, where these shares of their frames arrive."""
     return scene.strongest(point, np.flatnonzero(share >= _RARELY), MAX_ANCHORS_IN_USE)
-
-
-def _state_at(
-    settings: EstimatorSettings, anchors_m: Matrix, rows: Integers, point: Vector, has_phases: bool = False
-) -> State:
-    """The estimator's state at a point, with the site's anchors in these rows."""
-    s = new_state(settings)
-    s.status.walk_scale, s.status.has_phases = 1.0, has_phases
-    for axis in range(2 * s.dim):
-        s.P[at(axis, axis)] = _START_VARIANCE
-    for row in rows.tolist():
-        add_anchor(s, row, anchors_m[row], -1.0, False)
-    view(s.x)[: s.dim] = point[: s.dim]
-    if s.dim == 2:
-        s.settings.height_m = point[2]
-    return s
-
-
-def _steady_state(
-    s: State, superframe: Superframe, relays: Relays, share: Vector, delay_m: Vector, rows: Integers
-) -> SteadyState:
-    """The steady state of a tag that receives these shares of the anchors' messages, late by these delays."""
-    superframe_s, found = float(superframe.gap_s.sum()), SteadyState()
-    most = max(_MAX_SUPERFRAMES, math.ceil(_MAX_S / superframe_s))
-    step = max(1, math.ceil(_COMPLETE_OVER_S / superframe_s))
-    columns = _planned(superframe, relays, share, delay_m, rows)
-    _find_steady_state(s, *columns, len(superframe.sender), most, step, found)
-    return found
-
-
-def _planned(superframe: Superframe, relays: Relays, share: Vector, delay_m: Vector, rows: Integers) -> tuple[Any, Any]:
-    """A superframe's messages and their relays, as records."""
-    index_of = np.full(len(share), -1)
-    index_of[rows] = np.arange(len(rows))
-    messages: NDArray[Any] = np.zeros(len(superframe.sender), np.dtype(PlannedMessage))
-    sender = superframe.sender
-    messages["anchor"], messages["gap_ticks"] = index_of[sender], np.rint(superframe.gap_s / TICK_S)
-    messages["share"], messages["late_m"], messages["end"] = share[sender], delay_m[sender], relays.ends
-    listeners = np.repeat(sender, np.diff(relays.ends, prepend=0))
-    relayed: NDArray[Any] = np.zeros(len(relays.sender), np.dtype(PlannedRelay))
-    relayed["sender"], relayed["age_s"], relayed["late_m"] = index_of[relays.sender], relays.age_s, relays.delay_m
-    relayed["share"] = share[listeners] * share[relays.sender] * relays.share
-    return records(PlannedMessage, messages), records(PlannedRelay, relayed)
 
 
 MAX_PREDICTED: Final = 60
@@ -164,38 +87,29 @@ _FILTER_CHUNK: Final = 100
 _QA_M2PS3: Final = 0.3  # what a receiver assumes of a tag at rest
 
 
-class PlanSettings(Struct, frozen=True):
-    """Assumptions beyond the site file."""
-
-    noise_ps: float | None = None
-    """Noise of every TX and RX stamp; None for the site's own figures."""
-    channel: ChannelModel = ChannelModel()
-
-
 class Predictor:
     """Predictions of ``joint`` for one site."""
 
-    def __init__(self, site: Site, settings: PlanSettings) -> None:
-        self.site = with_noise(site, settings.noise_ps)
-        self.settings = settings
+    def __init__(self, site: Site, channel: ChannelModel) -> None:
+        self.site, self.channel = site, channel
         self.dim = 3 if site.tags.height_m is None else 2
         self.anchors_m = anchor_positions(site)
         self.master = row_of_master(site) if site.schedule.needs_master else None
         """Row of the master; None where there is none."""
-        self.budget, self.barriers = link_budget(settings.channel), barriers_of(site.walls, site.storeys)
+        self.budget, self.barriers = link_budget(channel), barriers_of(site.walls, site.storeys)
         self.hears_master: Vector = (
             np.ones(len(site.anchors))
             if self.master is None
             else master_links(self.anchors_m, self.master, self.budget, self.barriers)
         )
         """Share of the master's frames that each anchor receives; 1 where there is no master."""
-        self.superframe = superframe_of(self.site, self.hears_master)
+        self.superframe = superframe_of(site, self.hears_master)
         self.relays = relays_of(self.anchors_m, self.master, self.superframe, self.budget, self.barriers)
         self.scene = Scene(self.anchors_m, self.superframe.sent, self.budget, self.barriers)
         self.farthest_m = float(np.linalg.norm(np.ptp(self.anchors_m, axis=0)))
-        self._estimator = EstimatorSettings(qa=_QA_M2PS3, height_m=site.tags.height_m)
-        read_accuracy(self._estimator, *map(encode_page, filter_pages_of(self.site)))
-        fill_ages(self._estimator, superframe_s(site))
+        self.estimator = EstimatorSettings(qa=_QA_M2PS3, height_m=site.tags.height_m)
+        read_accuracy(self.estimator, *map(encode_page, filter_pages_of(site)))
+        fill_ages(self.estimator, superframe_s(site))
 
     def walked_sigma(self, points_m: Matrix, *, has_phases: bool) -> Vector:
         """Standard deviations that ``joint`` claims after walks of 1 m from points, along x and along y, shape (2·m,).
@@ -213,9 +127,9 @@ class Predictor:
         rows = anchors_in_use(self.scene, point, share)
         if len(rows) <= self.dim:
             return math.inf
-        s = _state_at(self._estimator, self.anchors_m, rows, point, has_phases)
+        s = self._state_at(rows, point, has_phases=has_phases)
         s.tuning.slow_forgetting = 0.0  # nothing is learnt from innovations of zero
-        columns, found = _planned(self.superframe, self.relays, share, np.zeros_like(share), rows), SteadyState()
+        columns, found = self._planned(share, np.zeros_like(share), rows), SteadyState()
         length_s = self.superframe.gap_s.sum()
         walked, at_rest = max(1, round(1.0 / length_s)), math.ceil(_RESTED_S / length_s)
         velocity = np.ascontiguousarray(velocity_mps / (walked * length_s))
@@ -233,7 +147,61 @@ class Predictor:
         return in_threads(self._errors, np.ascontiguousarray(points_m, np.float64), _FILTER_CHUNK, progress)
 
     def _errors(self, points: Matrix, table: Matrix) -> None:
-        fill_joint_sigma(points, self._estimator, self.scene, self.superframe, self.relays, self.farthest_m, table)
+        """Fill a table of predictions; there is no fix where the standard deviation would exceed ``farthest_m``."""
+        shares, delays_m = self.scene.heard_at(points)
+        fill_dops(self.scene, points, shares, self.dim, table)
+        table[:, SIGMA:], table[:, FIX_SHARE] = math.inf, 0.0
+        for row, point, share, delay_m in zip(table, points, shares, delays_m, strict=True):
+            rows = anchors_in_use(self.scene, point, share)
+            if len(rows) <= self.dim:
+                continue
+            found = self._steady_state(point, share, delay_m, rows)
+            claimed_m2 = view(found.variance_m2) / found.fixes
+            variance_m2 = np.maximum(claimed_m2 - view(found.motion_m2), 0.0)
+            sigma_m = math.sqrt(variance_m2.sum())
+            if not sigma_m < self.farthest_m:
+                continue
+            row[SIGMA], row[SIGMA_X : SIGMA_Z + 1] = sigma_m, np.sqrt(variance_m2)
+            row[BIAS] = math.sqrt(found.square_bias_m2 / found.fixes)
+            row[RMSE] = math.hypot(sigma_m, row[BIAS])
+            row[FIX_SHARE] = found.fixes / np.isin(self.superframe.sender, rows).sum()
+            row[CLAIMED] = math.sqrt(claimed_m2.sum())
+
+    def _state_at(self, rows: Integers, point: Vector, *, has_phases: bool = False) -> State:
+        """The estimator's state at a point, with the anchors in these rows."""
+        s = new_state(self.estimator)
+        s.status.walk_scale, s.status.has_phases = 1.0, has_phases
+        for axis in range(2 * s.dim):
+            s.P[at(axis, axis)] = _START_VARIANCE
+        for row in rows.tolist():
+            add_anchor(s, row, self.anchors_m[row], -1.0, False)
+        view(s.x)[: s.dim] = point[: s.dim]
+        if s.dim == 2:
+            s.settings.height_m = point[2]
+        return s
+
+    def _steady_state(self, point: Vector, share: Vector, delay_m: Vector, rows: Integers) -> SteadyState:
+        """The steady state of a tag that receives these shares of the anchors' messages, late by these delays."""
+        superframe_s, found = float(self.superframe.gap_s.sum()), SteadyState()
+        most = max(_MAX_SUPERFRAMES, math.ceil(_MAX_S / superframe_s))
+        step = max(1, math.ceil(_COMPLETE_OVER_S / superframe_s))
+        columns = self._planned(share, delay_m, rows)
+        _find_steady_state(self._state_at(rows, point), *columns, len(self.superframe.sender), most, step, found)
+        return found
+
+    def _planned(self, share: Vector, delay_m: Vector, rows: Integers) -> tuple[Any, Any]:
+        """The superframe's messages and their relays, as records."""
+        sender, relays = self.superframe.sender, self.relays
+        index_of = np.full(len(share), -1)
+        index_of[rows] = np.arange(len(rows))
+        messages: NDArray[Any] = np.zeros(len(sender), np.dtype(PlannedMessage))
+        messages["anchor"], messages["gap_ticks"] = index_of[sender], np.rint(self.superframe.gap_s / TICK_S)
+        messages["share"], messages["late_m"], messages["end"] = share[sender], delay_m[sender], relays.ends
+        listeners = np.repeat(sender, np.diff(relays.ends, prepend=0))
+        relayed: NDArray[Any] = np.zeros(len(relays.sender), np.dtype(PlannedRelay))
+        relayed["sender"], relayed["age_s"], relayed["late_m"] = index_of[relays.sender], relays.age_s, relays.delay_m
+        relayed["share"] = share[listeners] * share[relays.sender] * relays.share
+        return records(PlannedMessage, messages), records(PlannedRelay, relayed)
 
     def geometry_at(self, points_m: Matrix) -> Matrix:
         """Table with only anchors in view and DOPs; its column ``sigma_m`` is the weighted PDOP."""
@@ -243,13 +211,6 @@ class Predictor:
         share, _ = self.scene.heard_at(points)
         fill_dops(self.scene, points, share, self.dim, table)
         table[:, SIGMA] = weighted_pdop(self.scene, points, share, self.dim)
-
-
-def with_noise(site: Site, noise_ps: float | None) -> Site:
-    """The site with this noise of every stamp, or unchanged for None."""
-    if noise_ps is None:
-        return site
-    return replace(site, noise=replace(site.noise, tx_stamp_ps=noise_ps, rx_stamp_ps=noise_ps))
 
 
 def in_threads(
@@ -278,7 +239,8 @@ _NICE_POINTS: Final = 12_000
 MIN_BIAS_M: Final = 1e-4
 """Smaller mean errors of positions are ignored."""
 
-_STEPS_M: Final = (0.05, 0.1, 0.2, 0.25, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0)
+STEPS_M: Final = (0.05, 0.1, 0.2, 0.25, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0, 100.0)
+"""Usual steps of grids."""
 _JOINT_BUDGET: Final = 2.5e5
 """Points of the joint filter times the cost of one: the square of the anchors in view plus a constant."""
 
@@ -351,7 +313,7 @@ def grid_of(floor: Floor, heights_m: tuple[float, ...], step_m: float | None) ->
     if not (x2 > x1 and y2 > y1):
         raise ValueError("the region has no area")
     step = step_m or next(
-        (s for s in _STEPS_M if (x2 - x1) * (y2 - y1) / s**2 * len(heights_m) <= _NICE_POINTS), _STEPS_M[-1]
+        (s for s in STEPS_M if (x2 - x1) * (y2 - y1) / s**2 * len(heights_m) <= _NICE_POINTS), STEPS_M[-1]
     )
     nx, ny = max(round((x2 - x1) / step), 1), max(round((y2 - y1) / step), 1)
     if nx * ny * len(heights_m) > _MAX_POINTS:
@@ -510,13 +472,11 @@ def geojson_lines(plan: PlanMap, georeference: GeoreferenceSite | None) -> Itera
     coordinates = "[%.8f,%.8f,%.3f]" if georeference else "[%.3f,%.3f,%.3f]"
     geometry = f'"geometry":{{"type":"Point","coordinates":{coordinates}}}'
     pattern = f'{{"type":"Feature",{geometry},"properties":{{{keys}}}}}'
-    first = True
-    for rows in _pieces(plan):
+    for number, rows in enumerate(_pieces(plan)):
         if georeference:
             rows[:, :3] = to_wgs84(rows[:, :3], georeference)
         text = ",\n".join([pattern % row for row in map(tuple, rows.tolist())])
-        yield ("" if first else ",\n") + text.replace(":inf", ":null").replace(":nan", ":null")
-        first = False
+        yield (",\n" if number else "") + text.replace(":inf", ":null").replace(":nan", ":null")
     yield "\n]}\n"
 
 

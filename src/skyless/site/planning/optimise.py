@@ -20,7 +20,7 @@ from skyless.core.native.arithmetic import factorise, solve
 from skyless.core.native.library import KERNELS, compiled
 from skyless.core.native.records import Array, Reals, Record, Ticks, record
 from skyless.core.site import AnchorSite, Site
-from skyless.site.channel import Barriers, barriers_of
+from skyless.site.channel import Barriers, ChannelModel, barriers_of
 from skyless.site.planning.links import (
     FIX_SHARE,
     SIGMA,
@@ -31,7 +31,7 @@ from skyless.site.planning.links import (
     masters_by_links,
     sample_points,
 )
-from skyless.site.planning.maps import PlanSettings, Predictor, with_noise
+from skyless.site.planning.maps import Predictor
 from skyless.site.planning.superframe import stamp_variances
 
 _SEARCH_POINTS: Final = 140
@@ -82,8 +82,7 @@ def site_with_one_more(site: Site, position_m: Vector) -> Site:
     slots, schedule = site.schedule.slots, site.schedule
     if slots is not None and slots < (len(site.anchors) + 1) * schedule.frames_per_node:
         schedule = replace(schedule, slots=None)
-    x, y, z = position_m.tolist()
-    return replace(site, anchors=(*site.anchors, AnchorSite(number, x, y, z)), schedule=schedule)
+    return replace(site, anchors=(*site.anchors, AnchorSite(number, *position_m.tolist())), schedule=schedule)
 
 
 # The quick search on a lattice
@@ -258,7 +257,7 @@ class Search:
     def __init__(
         self,
         site: Site,
-        settings: PlanSettings,
+        channel: ChannelModel,
         floor: Floor,
         mounts: Mounts,
         heights_m: tuple[float, ...],
@@ -266,8 +265,8 @@ class Search:
         seed: int,
         seconds: float,
     ) -> None:
-        self._site, self._settings, self._mounts, self._anchors = site, settings, mounts, anchors
-        self._budget, self._barriers = link_budget(settings.channel), barriers_of(site.walls, site.storeys)
+        self._site, self._channel, self._mounts, self._anchors = site, channel, mounts, anchors
+        self._budget, self._barriers = link_budget(channel), barriers_of(site.walls, site.storeys)
         self._points = sample_points(floor, heights_m, _SEARCH_POINTS)
         self._floor, self._heights_m = floor, heights_m
         self._random = np.random.default_rng([seed, anchors])
@@ -330,7 +329,7 @@ class Search:
     def _lattice_starts(self, even: Layout) -> list[Layout]:
         all_along_m, all_levels = _candidates(self._mounts, _MAX_CANDIDATES, 2 * self._anchors)
         dim = 3 if self._site.tags.height_m is None else 2
-        noise_m = sum(stamp_variances(with_noise(self._site, self._settings.noise_ps))) ** 0.5
+        noise_m = sum(stamp_variances(self._site)) ** 0.5
         candidates_m = self._mounts.at(all_along_m, all_levels)
         has_master = self._site.schedule.needs_master
         lattice = lattice_of(
@@ -360,14 +359,13 @@ class Search:
     def _sigma(self, site: Site, sample: tuple[Matrix, Vector]) -> tuple[float, float, float]:
         """Mean and worst standard deviation over the points, capped, as without a fix; and the share with a fix."""
         self.evaluations += 1
-        rows = Predictor(site, self._settings).at(sample[0])
+        rows = Predictor(site, self._channel).at(sample[0])
         covered = rows[:, FIX_SHARE] >= 0.5
         sigma = np.where(covered, np.minimum(rows[:, SIGMA], self._cap_m), self._cap_m)
         return float(sample[1] @ sigma), float(sigma.max()), float(covered.mean())
 
     def _score(self, layout: Layout) -> tuple[float, float]:
-        mean, worst, _ = self._sigma(self._site_of(layout), self._points)
-        return mean, worst
+        return self._sigma(self._site_of(layout), self._points)[:2]
 
     def _refine(self, start: Layout, reference: tuple[float, float]) -> None:
         """Shift anchors along the walls, by decreasing steps, and between heights while that improves the score."""
@@ -434,17 +432,17 @@ class OneMore(Struct, frozen=True):
 
 
 def one_more(
-    site: Site, settings: PlanSettings, floor: Floor, mounts: Mounts, heights_m: tuple[float, ...]
+    site: Site, channel: ChannelModel, floor: Floor, mounts: Mounts, heights_m: tuple[float, ...]
 ) -> OneMore | None:
     """Try one more anchor at a hundred positions; None if none is free.
 
     The quick search on the lattice gives the position, the filter's prediction its benefit.
     """
-    before = Predictor(site, settings)
+    before = Predictor(site, channel)
     points, weights = sample_points(floor, heights_m, _SEARCH_POINTS)
     free = mounts.at(*_candidates(mounts, _MAX_CANDIDATES // 2))
     candidates_m = np.concatenate([before.anchors_m, free])
-    noise_m = sum(stamp_variances(before.site)) ** 0.5
+    noise_m = sum(stamp_variances(site)) ** 0.5
     lattice = lattice_of(
         candidates_m, points, weights, before.budget, before.barriers, before.dim, noise_m,
         has_master=before.master is not None,
@@ -456,7 +454,7 @@ def one_more(
     chosen = np.append(np.arange(n), n + int(np.argmax(gaps)))
     exchange(chosen, n, lattice, mean_and_worst(np.arange(n), lattice), _MAX_PASSES)
     position_m = candidates_m[chosen[n]]
-    after = Predictor(site_with_one_more(site, position_m), settings)
+    after = Predictor(site_with_one_more(site, position_m), channel)
     (mean_before, worst_before), (mean_after, worst_after) = (
         _mean_and_worst(predictor.at(points)[:, SIGMA], weights, lattice.cap_m) for predictor in (before, after)
     )

@@ -20,7 +20,6 @@ from skyless.core.native.library import KERNELS, compiled
 from skyless.core.native.records import Array, Reals
 from skyless.core.site import Site
 from skyless.site.channel import (
-    FREE_SPACE_LOSS_1_M_DB,
     Barrier,
     ChannelModel,
     barriers_of,
@@ -62,7 +61,6 @@ def tag_rates(site: Site, points_m: Matrix, channel: ChannelModel, exponent: flo
     anchors_m, period_s = anchor_positions(site), beacon_period_s(site)
     order = np.argsort(anchors_m[:, 0], kind="stable")
     weakest_dbm = channel.sensitivity_dbm - _CERTAIN_LOSS_WIDTHS * channel.sensitivity_width_db - channel.capture_db
-    budget_db = channel.tx_power_dbm - FREE_SPACE_LOSS_1_M_DB - weakest_dbm
     settings = np.array(
         [
             channel.tx_power_dbm,
@@ -71,7 +69,7 @@ def tag_rates(site: Site, points_m: Matrix, channel: ChannelModel, exponent: flo
             channel.capture_db,
             1.0 - channel.loss_probability,
             exponent,
-            10.0 ** (budget_db / (10.0 * exponent)),
+            range_of(channel.changed(sensitivity_dbm=weakest_dbm), exponent),
             2.0 * air_time_s(MAX_FRAME_BYTES) / period_s,
             RECEIVED_HZ * period_s,
         ]

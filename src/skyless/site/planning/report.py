@@ -1,5 +1,6 @@
 """The report of a plan: all results and warnings as one tree of plain values."""
 
+from collections.abc import Iterator
 from typing import Any, Final
 
 import msgspec
@@ -72,15 +73,15 @@ def plan_report(
     checked: Verification | None,
 ) -> dict[str, Any]:
     """The whole report, SI units."""
-    site, settings = predictor.site, predictor.settings
+    site, channel = predictor.site, predictor.channel
     heights = tuple(mapped.grid.heights_m.tolist())
-    more = one_more(site, settings, floor, mounts, heights) if len(site.anchors) < 200 else None
+    more = one_more(site, channel, floor, mounts, heights) if len(site.anchors) < 200 else None
     return {
         "site": site.name,
         "method": DEFAULT_METHOD,
         "tx_stamp_ps": site.noise.tx_stamp_ps,
         "rx_stamp_ps": site.noise.rx_stamp_ps,
-        "range_m": range_of(settings.channel),
+        "range_m": range_of(channel),
         "superframe_s": superframe_s(site),
         "master": site.master if site.schedule.needs_master else None,
         "dimensions": 3 if site.tags.height_m is None else 2,
@@ -167,7 +168,7 @@ def plan_warnings(predictor: Predictor, floor: Floor, plan: PlanMap) -> list[str
     """Warnings of anything that may cost accuracy or the fix, from the site and its map."""
     return [
         *warnings_of(predictor.site),
-        *master_warnings(predictor.site, predictor.settings.channel),
+        *master_warnings(predictor.site, predictor.channel),
         *_mirrors(predictor, floor, plan),
         *_holes(plan),
         *_weak(plan),
@@ -175,7 +176,7 @@ def plan_warnings(predictor: Predictor, floor: Floor, plan: PlanMap) -> list[str
     ]
 
 
-def _mirrors(predictor: Predictor, floor: Floor, plan: PlanMap) -> list[str]:
+def _mirrors(predictor: Predictor, floor: Floor, plan: PlanMap) -> Iterator[str]:
     """Warn of positions with a mirror image that fits as well, according to the solver with exact TDoAs."""
     points, _ = sample_points(floor, tuple(plan.grid.heights_m.tolist()), _MIRROR_POINTS)
     tx_var, rx_var = stamp_variances(predictor.site)
@@ -186,13 +187,13 @@ def _mirrors(predictor: Predictor, floor: Floor, plan: PlanMap) -> list[str]:
         for point, seen in zip(points, share >= IN_VIEW, strict=True)
         if _has_mirror(predictor.anchors_m[seen], point, height, tx_var, rx_var)
     ]
-    if not ambiguous:
-        return []
-    x, y, z = ambiguous[len(ambiguous) // 2]
-    return [
-        f"{len(ambiguous) / len(points):.0%} of the region has a mirror image that explains the measurements as well, "
-        f"for one around ({x:.1f}, {y:.1f}, {z:.1f}): vary the anchors' heights, or set tags.height_m if it is known"
-    ]
+    if ambiguous:
+        x, y, z = ambiguous[len(ambiguous) // 2]
+        yield (
+            f"{len(ambiguous) / len(points):.0%} of the region has a mirror image that explains the measurements as "
+            f"well, for one around ({x:.1f}, {y:.1f}, {z:.1f}): vary the anchors' heights, or set tags.height_m if it "
+            "is known"
+        )
 
 
 def _has_mirror(anchors: Array, point: Array, height_m: float | None, tx_var: float, rx_var: float) -> bool:
@@ -206,43 +207,38 @@ def _has_mirror(anchors: Array, point: Array, height_m: float | None, tx_var: fl
     return isinstance(solution, NoSolution) and solution.reason is NoFixReason.MIRROR
 
 
-def _holes(plan: PlanMap) -> list[str]:
+def _holes(plan: PlanMap) -> Iterator[str]:
     missing = np.where(plan.grid.within, plan.column(FIX_SHARE), np.nan) < 0.5
-    if not missing.any():
-        return []
-    part = missing.sum() / plan.grid.points
-    x, y, z = _central(plan, missing)
-    return [f"{part:.1%} of the region has no fix most of the time, as around ({x:.1f}, {y:.1f}, {z:.1f})"]
+    if missing.any():
+        part, (x, y, z) = missing.sum() / plan.grid.points, _central(plan, missing)
+        yield f"{part:.1%} of the region has no fix most of the time, as around ({x:.1f}, {y:.1f}, {z:.1f})"
 
 
-def _weak(plan: PlanMap) -> list[str]:
+def _weak(plan: PlanMap) -> Iterator[str]:
     sigma = np.where(plan.column(FIX_SHARE) >= 0.5, plan.column(SIGMA), np.nan)
     if not np.isfinite(sigma).any():
-        return []
+        return
     median, worst = float(np.nanmedian(sigma)), float(np.nanmax(sigma))
-    if worst < _WEAK_RATIO * median:
-        return []
-    part = float(np.nansum(sigma > _WEAK_RATIO * median)) / plan.grid.points
-    x, y, z = _central(plan, sigma == worst)
-    return [
-        f"weak corner at ({x:.1f}, {y:.1f}, {z:.1f}): {100 * worst:.1f} cm, {worst / median:.1f} times the median; "
-        f"{part:.1%} of the region is worse than {_WEAK_RATIO:g} times the median"
-    ]
+    if worst >= _WEAK_RATIO * median:
+        part = float(np.nansum(sigma > _WEAK_RATIO * median)) / plan.grid.points
+        x, y, z = _central(plan, sigma == worst)
+        yield (
+            f"weak corner at ({x:.1f}, {y:.1f}, {z:.1f}): {100 * worst:.1f} cm, {worst / median:.1f} times the median; "
+            f"{part:.1%} of the region is worse than {_WEAK_RATIO:g} times the median"
+        )
 
 
-def _walls(plan: PlanMap) -> list[str]:
+def _walls(plan: PlanMap) -> Iterator[str]:
     bias, sigma = plan.column(BIAS), plan.column(SIGMA)
     known = np.isfinite(bias) & np.isfinite(sigma)
     worse = known & (bias > sigma)
-    if not worse.any():
-        return []
-    largest = float(bias[known].max())
-    # The prediction does not include joint's fault monitors (docs/planning.md).
-    return [
-        f"walls' delays shift positions by more than their standard deviation in {worse.sum() / known.sum():.0%} of "
-        f"the region, by {100 * largest:.0f} cm at most; joint may take delays for faults of anchors there, and err "
-        "more than predicted"
-    ]
+    if worse.any():
+        # The prediction does not include joint's fault monitors (docs/planning.md).
+        yield (
+            f"walls' delays shift positions by more than their standard deviation in {worse.sum() / known.sum():.0%} "
+            f"of the region, by {100 * float(bias[known].max()):.0f} cm at most; joint may take delays for faults of "
+            "anchors there, and err more than predicted"
+        )
 
 
 def _central(plan: PlanMap, where: Mask) -> tuple[float, float, float]:
