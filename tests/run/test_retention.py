@@ -1,5 +1,6 @@
 """What is joined, thinned and removed, and that readers see every row once whenever the work stops."""
 
+import re
 from datetime import UTC, datetime
 
 import numpy as np
@@ -10,6 +11,7 @@ from made_fixes import DAY_S, NOON_S, fix, in_files, records
 from pyarrow import parquet
 from test_writer import dying
 
+from skyless.core.errors import SkylessError
 from skyless.run.fix_batch import records_of
 from skyless.run.history import writer as writer_module
 from skyless.run.history.layout import Place, current_events, current_files, file_name, rows_of, site_folder
@@ -41,6 +43,7 @@ def events_in(folder):
     return [t for file in current_events(folder, 1) for t in parquet.read_table(file)["t"].cast("int64").to_pylist()]
 
 
+@pytest.mark.site
 def test_a_day_that_is_over_becomes_one_file_and_old_ones_go(tmp_path):
     serials = filled(tmp_path, (-31, -2, -1, 0))
     assert len(current_files(tmp_path, 1)) == len(current_events(tmp_path, 1)) == 12
@@ -153,6 +156,32 @@ def test_thinning_keeps_rows_of_every_tag_and_minute(rows):
         xs = [x_mm for _, _, x_mm in mine]
         expected = len(set(parts(mine, 10))) if max(xs) - min(xs) > 500 else 1
         assert parts(kept, 60).count((tag, minute)) == expected
+
+
+@pytest.mark.site
+def test_what_the_daily_work_meets(tmp_path):
+    """Places at the ends of their range, long texts, a file that is damaged, and a folder like a pattern's."""
+    filled(tmp_path / "h1", (0,))
+    folder = tmp_path / "h[1]"
+    filled(folder, (-1,))
+    writer = Writer(folder, 1)
+    ends = records([1, 2], 1, NOON_S - 9 * DAY_S)
+    ends["position_mm"][:, 0] = -(2**31), 2**31 - 1
+    writer.fixes.add(ends, NOON_S - 9 * DAY_S)
+    at = datetime.fromtimestamp(NOON_S - 2 * DAY_S, UTC)
+    for _ in range(2):
+        writer.events.add([Event(at, "enter", "tag1", "z1", text="x" * 300)] * 100_000, NOON_S - 2 * DAY_S)
+        writer.write()
+    writer.close()
+    tidy(folder, 1, KEEP, NOON_S)
+    assert sorted(in_files(folder)) == [-(2**31), *range(1, 7)]
+    assert len(current_events(folder, 1)) == 2
+    damaged = filled(folder, (0,)) and current_files(folder, 1)[-2]
+    damaged.write_bytes(damaged.read_bytes()[:4] + b"\xff" * 200 + damaged.read_bytes()[204:])
+    with pytest.raises(
+        SkylessError, match=re.escape(f"{damaged} cannot be read; it should be a Parquet file with tag")
+    ):
+        tidy(folder, 1, KEEP, NOON_S + DAY_S)
 
 
 def test_a_day_is_joined_and_thinned_once_and_keeps_its_numbers(tmp_path):

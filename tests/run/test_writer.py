@@ -107,6 +107,7 @@ def test_a_writer_that_dies_at_any_operation_loses_nothing_and_repeats_nothing(t
     assert operation > 20
 
 
+@pytest.mark.site
 def test_a_random_series_of_deaths(tmp_path):
     chance, deaths = random.Random(36), 0
     for messages in range(5, 105, 5):

@@ -37,7 +37,17 @@ from skyless.run.history.layout import (
     site_folder,
     sites_in,
 )
-from skyless.run.history.tables import ROW_GROUP, connection, database, metadata_in, quoted, read_rows, select
+from skyless.run.history.tables import (
+    ROW_GROUP,
+    check_readable,
+    connection,
+    database,
+    metadata_in,
+    pattern,
+    quoted,
+    read_rows,
+    select,
+)
 from skyless.run.web import HISTORY as LIMITS
 
 # Times in cells and contacts need all rows: NumPy takes a third of DuckDB's processor time here.
@@ -53,7 +63,7 @@ _ScanInts = NDArray[Any]
 
 
 def time_in_cells(files: Sequence[Path], span: Span, cell_mm: int, tags: Collection[int] | None) -> Heatmap:
-    """Return how long tags were in each cell of a grid; ``tags`` None means all. Raises SkylessError, OSError.
+    """Return how long tags were in each cell of a grid; ``tags`` None means all. Raises SkylessError, duckdb.Error.
 
     A fix counts until the tag's next one in the range, up to ``GAP_S``, or ``THINNED_GAP_S`` in a thinned file. The
     tag's last fix does not count.
@@ -100,7 +110,7 @@ def near(
     """Find when other tags were near the tag with the numbers ``own``.
 
     Returns a row each for tags, first and last buckets of time, and least squared distances. Of ``own``, the first fix
-    in a bucket is compared. ``gap`` is the largest number of buckets between those of one contact. Raises OSError.
+    in a bucket is compared. ``gap`` is the largest number of buckets between those of one contact. Raises duckdb.Error.
     """
     firsts: list[tuple[_ScanInts, ...]] = []
     for (_, t, x, y), _ in fixes_in(files, span, own):
@@ -256,11 +266,8 @@ def _damaged(history: object) -> Path | None:
         kinds |= dict.fromkeys(current_events(history.folder, history.site), EVENT_COLUMNS)
         for file, columns in kinds.items():
             try:
-                with connection() as duck:
-                    found = select(duck, [file], columns)
-                    while found.fetchmany(10_000):
-                        pass
-            except _UNREADABLE:
+                check_readable(file, columns)
+            except SkylessError:
                 return file
     return None
 
@@ -304,7 +311,7 @@ class History:
         newest = [file for file in files if day_of(file) == last_day]
         sql = "SELECT epoch_ms(max(t)) FROM read_parquet($file)"  # answered from the files' statistics
         with connection() as duck:
-            found = [row for file in newest for row in duck.execute(sql, {"file": str(file)}).fetchall()]
+            found = [row for file in newest for row in duck.execute(sql, {"file": pattern(file)}).fetchall()]
         return max((ms / 1000 for (ms,) in found if ms is not None), default=None)
 
     # Queries
@@ -418,7 +425,7 @@ class History:
         with database() as duck:
             for name, (columns, files) in tables.items():
                 if files:
-                    listed = ", ".join(quoted(file.resolve()) for file in files)
+                    listed = ", ".join(quoted(pattern(file.resolve())) for file in files)
                     duck.execute(f"CREATE VIEW {name} AS SELECT {', '.join(columns)} FROM read_parquet([{listed}])")
                 else:
                     nothing = ", ".join(f"CAST(NULL AS {kind}) AS {column}" for column, kind in columns.items())
@@ -518,7 +525,7 @@ class _Way:
 
 def _stream(sql: str, files: Iterable[Path], span: Span, **more: object) -> Iterator[tuple[Any, ...]]:
     """Yield the rows of a result, with few of them in memory at once."""
-    parameters = {"files": list(map(str, files)), "begin": span.from_unix_s, "end": span.to_unix_s} | more
+    parameters = {"files": list(map(pattern, files)), "begin": span.from_unix_s, "end": span.to_unix_s} | more
     if parameters["files"]:
         with connection() as duck:
             found = duck.execute(sql, parameters)

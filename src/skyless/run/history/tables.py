@@ -13,6 +13,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from datetime import UTC, datetime
 from functools import cache
 from pathlib import Path
+from threading import Lock
 from typing import Any, Final
 
 import duckdb
@@ -73,27 +74,39 @@ def event_columns(events: Sequence[Event]) -> Columns:
 def columns_of(rows: Sequence[Mapping[str, object]], kinds: Mapping[str, str]) -> Columns:
     """Convert rows to columns of the kinds of ``layout.py``."""
     return {
-        name: np.array([row[name] for row in rows], object if kind == "VARCHAR" else np.int64)
+        name: np.array(
+            [row[name] if kind == "VARCHAR" else row[name] or 0 for row in rows],
+            object if kind == "VARCHAR" else np.int64,
+        )
         for name, kind in kinds.items()
     }
 
 
-def database() -> duckdb.DuckDBPyConnection:
+def database(memory_mb: int = LIMITS.memory_mb) -> duckdb.DuckDBPyConnection:
     """Open DuckDB with temporary files only, and without the network."""
     spill = str(Path(tempfile.gettempdir()) / f"skyless-history-{secrets.token_hex(8)}")  # created only if needed
-    options: dict[str, Any] = {"memory_limit": f"{LIMITS.memory_mb}MB", "temp_directory": spill}
+    options: dict[str, Any] = {"memory_limit": f"{memory_mb}MB", "temp_directory": spill}
     # One thread takes less processor time in total, and leaves the other cores to the site.
     options |= {"autoinstall_known_extensions": "false", "python_enable_replacements": "false", "threads": 1}
     return duckdb.connect(config=options)
 
 
 _shared_database = cache(database)
-"""One for the process, as opening one takes 15 ms."""
+"""One to read and one to write for the process, as opening one takes 15 ms."""
+_WRITING_MB: Final = 512
+"""For the largest day of events with long texts that is joined."""
+_writing: Final = Lock()
+"""A hub's sites write one after the other, within that memory."""
 
 
 def connection() -> duckdb.DuckDBPyConnection:
     """Connect to this process's database, for one thread; it should be closed."""
     return _shared_database().cursor()
+
+
+def pattern(file: Path) -> str:
+    """A file's path where DuckDB takes a pattern."""
+    return re.sub(r"([*?\[])", r"[\1]", str(file))
 
 
 def select(
@@ -105,7 +118,7 @@ def select(
         for name, kind in kinds.items()
     )
     sql = f"SELECT {values} FROM read_parquet($files, hive_partitioning = false) WHERE {wanted}"
-    return duck.execute(sql, {"files": list(map(str, files))})
+    return duck.execute(sql, {"files": list(map(pattern, files))})
 
 
 def metadata_in(duck: duckdb.DuckDBPyConnection, files: Iterable[Path]) -> dict[Path, dict[str, str]]:
@@ -113,7 +126,7 @@ def metadata_in(duck: duckdb.DuckDBPyConnection, files: Iterable[Path]) -> dict[
     found: dict[Path, dict[str, str]] = {file: {} for file in files}
     sql = f"""SELECT file_name, decode(key), decode(value) FROM parquet_kv_metadata($files)
         WHERE key IN ('{PLACE}'::BLOB, '{THINNED}'::BLOB)"""
-    for file, key, value in duck.execute(sql, {"files": list(map(str, found))}).fetchall() if found else ():
+    for file, key, value in duck.execute(sql, {"files": list(map(pattern, found))}).fetchall() if found else ():
         found[Path(file)][key] = value
     return found
 
@@ -143,6 +156,14 @@ def read_rows(file: Path, kinds: Mapping[str, str], wanted: str = "true") -> lis
     """Read the wanted rows of a file. Raises SkylessError if it cannot be read or lacks a column."""
     with _reading(file, f" with {', '.join(kinds)}") as duck:
         return [dict(zip(kinds, row, strict=True)) for row in select(duck, [file], kinds, wanted).fetchall()]
+
+
+def check_readable(file: Path, kinds: Mapping[str, str]) -> None:
+    """Read a whole file. Raises SkylessError if it cannot be read or lacks a column."""
+    with _reading(file, f" with {', '.join(kinds)}") as duck:
+        found = select(duck, [file], kinds)
+        while found.fetchmany(10_000):
+            pass
 
 
 def metadata_of(file: Path) -> dict[str, str]:
@@ -180,17 +201,20 @@ def write_table(
         f"make_timestamptz(1000 * {name}) AS {name}" if kind == TIME else f"CAST({name} AS {kind}) AS {name}"
         for name, kind in kinds.items()
     )
-    with connection() as duck:
-        duck.register("rows", table)
-        write_answer(duck, f"SELECT {values} FROM rows", file, metadata)
+    try:
+        write_answer(f"SELECT {values} FROM rows", file, metadata, rows=table)
+    except duckdb.Error as error:
+        raise OSError(errno.EIO, _first_line(error), str(file)) from None
 
 
-def write_answer(
-    duck: duckdb.DuckDBPyConnection, query: str, file: Path, metadata: Mapping[str, str] | None = None
-) -> None:
-    """Write the answer of a query to a file, atomically and durably. Raises OSError.
+def write_answer(query: str, file: Path, metadata: Mapping[str, str] | None = None, **tables: Columns) -> None:
+    """Write the answer of a query to a file, atomically and durably; it may name ``tables``.
 
     A program that is killed meanwhile leaves a file of the same name with ``.tmp``.
+
+    Raises:
+        OSError: the file cannot be written.
+        duckdb.Error: the query cannot be answered.
     """
     file.parent.mkdir(parents=True, exist_ok=True)
     scratch = file.with_name(f"{file.name}.tmp")
@@ -198,13 +222,16 @@ def write_answer(
     if metadata:
         options += f", KV_METADATA {{{', '.join(f'{key}: {quoted(text)}' for key, text in metadata.items())}}}"
     try:
-        duck.execute(f"COPY ({query}) TO {quoted(scratch)} ({options})")
+        with _writing, _shared_database(_WRITING_MB).cursor() as duck:
+            for name, table in tables.items():
+                duck.register(name, table)
+            duck.execute(f"COPY ({query}) TO {quoted(scratch)} ({options})")
         _sync(scratch)
         scratch.replace(file)
     except BaseException as error:
         with contextlib.suppress(OSError):
             scratch.unlink()
-        if isinstance(error, duckdb.Error):
+        if isinstance(error, duckdb.IOException) and str(scratch) in str(error):
             stated = re.search(r'"errno":"(\d+)"', str(error))
             why = (int(stated[1]), os.strerror(int(stated[1]))) if stated else (errno.EIO, _first_line(error))
             raise OSError(*why, str(file)) from None

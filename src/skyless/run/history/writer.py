@@ -17,6 +17,7 @@ from pathlib import Path
 from threading import Lock
 from typing import Any, Final, Literal
 
+import duckdb
 import msgspec
 import numpy as np
 from msgspec import Struct
@@ -41,11 +42,12 @@ from skyless.run.history.layout import (
 from skyless.run.history.tables import (
     Columns,
     Event,
+    check_readable,
     columns_of,
-    connection,
     event_columns,
     fix_columns,
     metadata_of,
+    pattern,
     place_in,
     quoted,
     read_rows,
@@ -258,18 +260,18 @@ class Writer:
 # file's name covers the files that it replaces (``layout.py``), and a thinned file replaces the original atomically.
 
 JOINED_ROWS: Final = 2_000_000
-"""Rows of a joined file: it must fit into memory several times."""
+"""Rows of a joined file: its columns fit into memory."""
 
 THINNING: Final = """
     SELECT {columns} FROM ({rows})
     WINDOW minute AS (PARTITION BY tag, epoch_ms(t) // 60000),
-        up_to_now AS (PARTITION BY tag, epoch_ms(t) // 60000 ORDER BY t),
         step AS (PARTITION BY tag, epoch_ms(t) // 10000 ORDER BY t)
-    QUALIFY row_number() OVER up_to_now = 1 OR (row_number() OVER step = 1 AND greatest(
-        max(x_mm) OVER minute - min(x_mm) OVER minute, max(y_mm) OVER minute - min(y_mm) OVER minute,
-        max(z_mm) OVER minute - min(z_mm) OVER minute) > 500)
+    QUALIFY row_number() OVER step = 1 AND (t = min(t) OVER minute OR greatest(
+        max(x_mm::BIGINT) OVER minute - min(x_mm) OVER minute, max(y_mm::BIGINT) OVER minute - min(y_mm) OVER minute,
+        max(z_mm::BIGINT) OVER minute - min(z_mm) OVER minute) > 500)
 """
-"""One fix per ten seconds of a moving tag, one per minute of one at rest: no coordinate changes by more than 0.5 m."""
+"""A tag is at rest in a minute in which no coordinate changes by more than 0.5 m. Of such a minute one fix is kept,
+otherwise one of every ten seconds."""
 
 
 class Keep(Struct, frozen=True):
@@ -300,24 +302,35 @@ def _tidy(
         if age_days > days:
             _remove(file for file in of_day if file != newest)
             if newest and day == day_of(newest):  # it has the place
-                with connection() as duck:
-                    write_answer(duck, f"SELECT {names} FROM {_rows_in([newest])} LIMIT 0", newest, metadata_of(newest))
+                _rewrite([newest], newest, columns, f"SELECT {names} FROM {_rows_in([newest])} LIMIT 0", {})
             continue
         for files, first, last in _groups(of_day) if age_days > 0 else ():
             is_thinned = age_days <= full_days or all(THINNED in metadata_of(file) for file in files)
             if is_thinned and len(files) == 1:
                 continue
-            select, metadata = f"SELECT {names} FROM {_rows_in(files)}", metadata_of(files[-1])
+            select, more = f"SELECT {names} FROM {_rows_in(files)}", dict[str, str]()
             if age_days > full_days:
-                select, metadata = THINNING.format(columns=names, rows=select), metadata | {THINNED: "yes"}
+                select, more = THINNING.format(columns=names, rows=select), {THINNED: "yes"}
             joined = files[0].with_name(file_name(first, last))
-            with connection() as duck:
-                write_answer(duck, f"{select} ORDER BY {order_by}", joined, metadata)
+            _rewrite(files, joined, columns, f"{select} ORDER BY {order_by}", more)
             _remove(file for file in files if file != joined)
 
 
+def _rewrite(files: Sequence[Path], to: Path, kinds: Mapping[str, str], query: str, more: Mapping[str, str]) -> None:
+    """Write what a query makes of files, with the metadata of the last one and ``more``.
+
+    Raises OSError; SkylessError, which names the file that cannot be read.
+    """
+    try:
+        write_answer(query, to, metadata_of(files[-1]) | dict(more))
+    except duckdb.Error as error:
+        for file in files:
+            check_readable(file, kinds)
+        raise SkylessError(f"{to} cannot be made of {files[0]} and others: {error}") from None
+
+
 def _rows_in(files: Iterable[Path]) -> str:
-    return f"read_parquet([{', '.join(map(quoted, files))}], hive_partitioning = false)"
+    return f"read_parquet([{', '.join(quoted(pattern(file)) for file in files)}], hive_partitioning = false)"
 
 
 def _groups(files: Iterable[Path]) -> Iterator[tuple[list[Path], int, int]]:

@@ -660,7 +660,9 @@ class Fitted(RobustFit, frozen=True, eq=False):
 
     @property
     def silent(self) -> tuple[int, ...]:
-        """Fitted anchors without a range, whose delays nothing shows."""
+        """Kept anchors without a range, whose delays nothing shows."""
+        if not self.measured.facts.keep_positions:
+            return ()
         ranged = {anchor for pair in self.pairs for anchor in (pair.a, pair.b)}
         return tuple(anchor for anchor in self.anchors if anchor not in ranged)
 
