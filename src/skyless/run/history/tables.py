@@ -139,10 +139,11 @@ def _reading(file: Path, what: str = "") -> Iterator[duckdb.DuckDBPyConnection]:
             yield duck
     except duckdb.Error as error:
         right = f"it should be a Parquet file{what}"
-        raise SkylessError(f"{file} cannot be read; {right}: {_first_line(error)}") from None
+        raise SkylessError(f"{file} cannot be read; {right}: {first_line(error)}") from None
 
 
-def _first_line(error: duckdb.Error) -> str:
+def first_line(error: duckdb.Error) -> str:
+    """What an error says, without the part of the query to which it points."""
     return str(error).partition("\n")[0]
 
 
@@ -204,7 +205,7 @@ def write_table(
     try:
         write_answer(f"SELECT {values} FROM rows", file, metadata, rows=table)
     except duckdb.Error as error:
-        raise OSError(errno.EIO, _first_line(error), str(file)) from None
+        raise OSError(errno.EIO, first_line(error), str(file)) from None
 
 
 def write_answer(query: str, file: Path, metadata: Mapping[str, str] | None = None, **tables: Columns) -> None:
@@ -233,7 +234,7 @@ def write_answer(query: str, file: Path, metadata: Mapping[str, str] | None = No
             scratch.unlink()
         if isinstance(error, duckdb.IOException) and str(scratch) in str(error):
             stated = re.search(r'"errno":"(\d+)"', str(error))
-            why = (int(stated[1]), os.strerror(int(stated[1]))) if stated else (errno.EIO, _first_line(error))
+            why = (int(stated[1]), os.strerror(int(stated[1]))) if stated else (errno.EIO, first_line(error))
             raise OSError(*why, str(file)) from None
         raise
     _sync(file.parent)  # makes the file's name durable, too

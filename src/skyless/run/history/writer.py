@@ -45,6 +45,7 @@ from skyless.run.history.tables import (
     check_readable,
     columns_of,
     event_columns,
+    first_line,
     fix_columns,
     metadata_of,
     pattern,
@@ -326,7 +327,7 @@ def _rewrite(files: Sequence[Path], to: Path, kinds: Mapping[str, str], query: s
     except duckdb.Error as error:
         for file in files:
             check_readable(file, kinds)
-        raise SkylessError(f"{to} cannot be made of {files[0]} and others: {error}") from None
+        raise SkylessError(f"{to} cannot be made of {files[0]} and others: {first_line(error)}") from None
 
 
 def _rows_in(files: Iterable[Path]) -> str:
