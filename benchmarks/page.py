@@ -106,7 +106,7 @@ def server_row(tags, anchors):
     condition = site.live.condition
     page = site.live.open_page()
     sizes = {json.loads(m)["type"]: len(m) for m in asyncio.run(page.drain(site.live.state))}
-    offline = sum(kind == "bad" for kind in site.live.state._conditions.values())
+    offline = sum(kind == "bad" for kind in site.live.state.conditions.values())
     payloads = []
     for k in range(max(tags, FIXES)):
         made = fix(f"t{k % tags}", times.unix_s + 0.05 * (k // tags), (k % 7, 1.0, 1.0), latency_s=0.0)

@@ -13,6 +13,7 @@ import pytest
 from dashboard_builders import SITE, SITE_ID, Times, Wire, fix, status
 from test_dashboard_condition import anchor_health
 
+from skyless.bridges.foxglove import FoxgloveTarget
 from skyless.bridges.home_assistant import Announcer
 from skyless.bridges.prometheus import SiteMetrics
 from skyless.bridges.target import Hub, Route, Target, bridged_site
@@ -22,6 +23,8 @@ from skyless.page.live import LiveSite
 from skyless.run.fix_batch import FIELDS, fix_of, records_of
 from skyless.run.gather.node import SiteCondition
 from skyless.run.gather.streams import TagName
+from skyless.run.gather.subjects import NatsAddress
+from skyless.run.hub import HubSites
 from skyless.run.mqtt import topics
 from skyless.run.mqtt.messages import TagZones, Zone, ZonesMessage
 from skyless.run.mqtt.topics import tag_zones_topic
@@ -65,8 +68,19 @@ class Both(Target):
         return (found.usable, sorted(found.zones))
 
 
+class Shown(FoxgloveTarget):
+    """What a client that has subscribed to everything gets last, by topic."""
+
+    def __init__(self):
+        super().__init__("foxglove:", "127.0.0.1", 0)
+        self.newest = {}
+
+    def _give(self, topic, schema, unix_s, encode):
+        self.newest[topic] = unix_s, msgspec.json.decode(encode())
+
+
 class Views:
-    """The page, its HTTP interface, ``skyless watch``, a bridge and a gather, all of the same messages."""
+    """The page, its HTTP interface, ``skyless watch``, bridges, a gather and its hub, all of the same messages."""
 
     def __init__(self):
         self.times, self.wires = Times(), (Wire(), Wire(), Wire())
@@ -79,8 +93,9 @@ class Views:
         self.watch = SiteView(self.wires[1], SITE_ID, *clocks)
         self.wires[1].on_state[0](True)
         site = bridged_site(SITE.whole_site, ZONES, simulated=True)
-        self.both = Both(site)
-        self.hub = Hub([Route(self.both, None, 1000.0)], print)
+        self.both, self.foxglove = Both(site), Shown()
+        self.sites = HubSites(NatsAddress("hub", 1, ""), self.times.now_s)
+        self.hub = Hub([Route(target, None, 1000.0) for target in (self.both, self.foxglove)], print)
         self.hub.on_site(site)
         self.say(topics.site_topic(SITE_ID), SITE)
         self.wires[2].deliver(topics.site_topic(SITE_ID), SITE)
@@ -118,6 +133,11 @@ class Views:
         self.watch.evaluate()
         self.hub.on_tick(self.times.now_s, self.times.unix_s)
         self.judged = self.gathered.reasons({}, 0, self.times.now_s)
+        word, reasons = self.judged
+        summary = {"unix_s": self.times.unix_s, "host": "", "version": "", "site": "here", "simulated": True}
+        summary |= {"condition": word, "reasons": reasons, "tags_heard": self.gathered.tags_heard(self.times.now_s)}
+        summary |= {"names": 0, "online": {}, "fixes": 0, "batches": 0, "waiting": 0, "drops": {}, "cuts": 0}
+        self.sites.add_summary(1, msgspec.json.encode(summary), self.times.now_s, self.times.unix_s)
 
     def compare(self):
         """Check that all views agree on each tag; the words for what they say."""
@@ -138,6 +158,9 @@ class Views:
             age_s, (fresh_s, sleep_s, gone_s) = self.times.now_s - tag.fix_s, shown[name][-3:]
             assert (is_fresh, sleep_s) == (age_s < fresh_s, 0.0)
             assert is_there == (age_s < gone_s)
+            (unix_s, newest), fix = self.foxglove.newest[f"/tag/{name}/fix"], tag.fix
+            assert (newest["position_m"], newest["unix_s"], unix_s) == ([*fix.position_m], fix.unix_s, fix.unix_s)
+            assert self.foxglove.newest[f"/tag/{name}/pose"][1]["pose"]["position"]["x"] == shown[name][1]
             if tag.online is not False:  # batches do not tell that a program has ended
                 assert self.batched.presence(name) == answer.presence
                 assert PLACE(in_batches[name]) == pytest.approx(PLACE(shown[name]))
@@ -147,7 +170,9 @@ class Views:
         judged = self.batched.condition
         assert self.judged[1] == [reason.text for reason in judged.reasons]
         assert self.judged[0] == {"warning": "degraded"}.get(judged.level, judged.level)
-        assert self.gathered.tags_heard(self.times.now_s) == sum(presence != "gone" for presence, _ in found.values())
+        (site,) = self.sites.sites(self.times.now_s)
+        assert (site.condition, site.reason) == (self.judged[0], "".join(self.judged[1][:1]))
+        assert site.tags_heard == sum(presence != "gone" for presence, _ in found.values())
         assert self.page.condition.tags_with_fix == sum(presence == "fresh" for presence, _ in found.values())
         return found
 

@@ -16,9 +16,10 @@ from websockets.asyncio.client import connect as websocket
 from skyless.page import hub
 from skyless.page.live import LiveSite
 from skyless.run.gather.subjects import NatsAddress
-from skyless.run.hub import LISTEN_S, SILENT_S, HubLink, HubSites, make_hub_streams
+from skyless.run.hub import LISTEN_S, HubLink, HubSites, make_hub_streams
 from skyless.run.mqtt import topics
 from skyless.run.mqtt.messages import StatusMessage, ZonesMessage
+from skyless.run.site_table import THRESHOLDS
 from support.processes import SKYLESS, running_program
 from support.small_hub import client_of, running_hub, site
 from support.waiting import running, until
@@ -40,11 +41,11 @@ def test_the_table_has_trouble_first_and_nothing_is_good_that_is_not_heard():
     assert {site.condition for site in table.sites(1.0)} == {"unknown"}
     table.add_summary(1, said(condition="good"), 100.0, 5.0)
     table.add_summary(2, said(condition="degraded", reasons=["anchor 3 is silent", "another"]), 100.0, 5.0)
-    table.add_summary(3, said(condition="good"), 100.0 + SILENT_S - 180.0, 5.0)
+    table.add_summary(3, said(condition="good"), 100.0 + THRESHOLDS.site_s - 180.0, 5.0)
     table.add_summary(4, said(), 100.0, 5.0)  # of an older version
     table.add_summary(5, b"no JSON", 100.0, 5.0)
     table.add_summary(6, said(condition="bad", site="not in the stream yet"), 100.0, 5.0)
-    found = table.sites(100.0 + SILENT_S)
+    found = table.sites(100.0 + THRESHOLDS.site_s)
     assert [(one.number, one.condition) for one in found] == [
         (6, "bad"), (3, "cut"), (5, "cut"), (2, "degraded"), (4, "unknown"), (1, "good"),
     ]  # fmt: skip

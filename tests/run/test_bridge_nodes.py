@@ -6,9 +6,11 @@ import json
 import signal
 from types import SimpleNamespace
 
+import msgspec
 import pytest
 from msgspec import structs
 
+from skyless.bridges import program
 from skyless.bridges.program import BridgeNode, TagBridge, heard_site, run_route
 from skyless.bridges.target import Hub, Route, Target
 from skyless.core.air.almanac import GeoreferencePage
@@ -16,6 +18,7 @@ from skyless.core.air.frame import Reception
 from skyless.core.any_receiver import AnyReceiver
 from skyless.core.errors import SkylessError
 from skyless.core.tag.receiver import HeardSite
+from skyless.run.mqtt.address import MqttAddress
 from skyless.run.mqtt.link import Link
 from skyless.run.mqtt.messages import SiteMessage, StatusMessage, Zone, ZonesMessage
 from skyless.run.mqtt.topics import EVERY_NODE, fix_topic, health_topic, site_topic, status_topic, zones_topic
@@ -101,6 +104,26 @@ async def test_all_that_targets_need_comes_from_the_broker_and_nonsense_is_count
             await until(lambda: target.none)
             state = node.state()
             assert (state.fixes, state.malformed, state.dropped) == (1, 2, {"test:": {}})
+
+
+def test_no_fix_is_said_of_tags_that_should_have_one_and_not_of_tags_that_send_rarely(monkeypatch):
+    said, clock = [], SimpleNamespace(now_s=100.0)
+    monkeypatch.setattr(program, "time", SimpleNamespace(monotonic=lambda: clock.now_s, time=lambda: clock.now_s))
+    node = BridgeNode(Hub([Route(Recorded(), None, 50.0)], said.append), MqttAddress("nowhere", 1), LAB.id, said.append)
+    node.link.connected = True
+    node.hub.table.set_connected(connected=True, now_s=clock.now_s)
+    node.feed.receive(site_topic(LAB.id), msgspec.json.encode(SiteMessage(LAB, True, 0.0)))
+    for second in range(600):
+        clock.now_s += 1.0
+        if second == 8:
+            assert said == ["no fix for 5 s: no tag publishes fixes; skyless dashboard shows why"]
+            said.clear()
+        if second >= 8 and second % 10 == 8 and second < 500:
+            node.feed.receive(fix_topic(LAB.id, "tag1"), msgspec.json.encode(a_fix(unix_s=clock.now_s)))
+        node._on_tick()
+        if second == 60:
+            said.clear()  # its interval is known now
+    assert said == ["no fix for 25 s: no tag publishes fixes; skyless dashboard shows why"]
 
 
 async def test_a_site_that_lacks_what_the_only_target_needs_ends_the_bridge_with_the_reason(tmp_path):

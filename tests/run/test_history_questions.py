@@ -15,7 +15,7 @@ from pyarrow import parquet
 from skyless.core.alert import Alert
 from skyless.core.errors import SkylessError
 from skyless.run.history import queries
-from skyless.run.history.answers import GAP_S, Contact, Dwell, Span
+from skyless.run.history.answers import Contact, Dwell, Span
 from skyless.run.history.layout import (
     ASSET_COLUMNS,
     EVENT_COLUMNS,
@@ -136,6 +136,18 @@ def within(rows):
     return {name: values[order] for name, values in part.items()}
 
 
+def plain_gap_ms(t):
+    """The silence after which a tag with fixes at these times in ms would be gone."""
+    gaps_ms = [one for one in np.diff(t) if one <= 900_000]
+    long_s = [round(one / 1000) for one in gaps_ms if one > 1500]
+
+    def is_usual(gap_s):
+        longer_s = [one for one in long_s if one >= gap_s]
+        return len(longer_s) >= 3 and sum(longer_s) >= 0.15 * sum(gaps_ms) / 1000
+
+    return 1000 * min(max(10, 4 * max(filter(is_usual, {*long_s}), default=0)), 900)
+
+
 def test_tags_and_zones(history):
     assert history.tags() == tuple(sorted([*(f"tag{k}" for k in range(1, TAGS)), "renamed"]))
     assert history.zones()["a"] == ("Hall", ((0.0, 0.0), (4.0, 0.0), (4.0, 4.0)))
@@ -179,10 +191,10 @@ def test_tags_are_found_by_the_names_of_their_assets(history):
 
 
 def plain_length(own):
-    total, at = 0.0, None
+    total, at, gap_ms = 0.0, None, plain_gap_ms(own["t"])
     for k in range(len(own["t"])):
         here = np.array([own["x_mm"][k], own["y_mm"][k]])
-        if at is None or own["t"][k] - own["t"][k - 1] > 1000 * GAP_S:
+        if at is None or own["t"][k] - own["t"][k - 1] > gap_ms:
             at = here
         elif np.hypot(*(here - at)) >= max(250, 3 * own["std_mm"][k]):
             total, at = total + np.hypot(*(here - at)), here
@@ -198,7 +210,7 @@ def test_a_thinned_track_keeps_its_ends_and_its_length(history, most):
     assert (thin.fixes, thin.length_m) == (whole.fixes, whole.length_m)
     if most >= 100:
         for before, after in pairwise(whole.points):
-            assert after.unix_s - before.unix_s <= GAP_S or {before, after} <= set(thin.points)
+            assert after.unix_s - before.unix_s <= whole.gap_s or {before, after} <= set(thin.points)
 
 
 @pytest.mark.parametrize("tags", [(), ("tag3",), ("tag3", "renamed")])
@@ -209,8 +221,9 @@ def test_a_heatmap_is_the_time_until_the_next_fix(history, within, tags):
     for tag in [numbers[one] for one in tags] or range(1, TAGS + 1):
         own = within["tag"] == tag
         t, cells = within["t"][own], np.column_stack([within["x_mm"][own], within["y_mm"][own]]) // 300
+        gap_ms = plain_gap_ms(t)
         for k in range(len(t) - 1):
-            seconds[tuple(cells[k].tolist())] += min(t[k + 1] - t[k], 1000 * GAP_S) / 1000
+            seconds[tuple(cells[k].tolist())] += min(t[k + 1] - t[k], gap_ms) / 1000
     found = np.array(heatmap.seconds).reshape(heatmap.rows, heatmap.columns)
     x0, y0 = round(heatmap.x0_m / 0.3), round(heatmap.y0_m / 0.3)
     given_ = {(x0 + int(k), y0 + int(j)): found[j, k] for j, k in zip(*np.nonzero(found), strict=True)}
@@ -371,27 +384,55 @@ def test_a_file_that_is_replaced_while_it_is_read(history, monkeypatch):
         history.heatmap(SPAN)
 
 
-def test_days_that_are_thinned(tmp_path):
-    """Their fixes, one in ten seconds or in a minute, count longer, and are compared within ten seconds."""
-    site, minutes = site_folder(tmp_path, 2), 60
-    rest = [(1, 60_000 * k + 300, 1000, 1000) for k in range(minutes)]
-    near = [(2, 60_000 * k + 1200, 2500, 1000) for k in range(10, 20)]
-    moving = [(3, 10_000 * k + 900, 500 * k, 9000) for k in range(6 * minutes)]
-    tags, ms, x_mm, y_mm = (np.array(column) for column in zip(*rest, *near, *moving, strict=True))
-    begin_ms = round(1000 * MIDNIGHT)
-    rows = {"tag": tags, "t": begin_ms + ms, "x_mm": x_mm, "y_mm": y_mm}
-    rows |= {name: np.full(len(tags), 10) for name in FIX_COLUMNS if name not in rows}
-    write_fixes(site, rows, 1, len(tags))
-    (file,) = site.glob("day=*/*.parquet")
-    parquet.write_table(parquet.ParquetFile(file).read().replace_schema_metadata({b"skyless_thinned": b"yes"}), file)
-    names = {"tag": [1, 2, 3], "name": ["rest", "near", "moving"], "since": [0, 0, 0]}
+@pytest.fixture(params=[1_000_000, 50], ids=["one file", "many files"])
+def sleepers(request, tmp_path):
+    """An hour of tags that send rarely, next to each other or on a way, and of one that sends often for 10 minutes."""
+    site, draw = site_folder(tmp_path, 2), np.random.default_rng(3)
+    intervals_s = {"minute": 60.0, "ten": 10.0, "bursts": 40.0, "five": 300.0, "often": 0.5}
+    columns = []
+    for number, (name, interval_s) in enumerate(intervals_s.items(), 1):
+        s = np.arange(2.0, 3599.0, interval_s)
+        if name == "bursts":
+            s = np.concatenate([s + 0.1 * k for k in range(20)])
+        if name == "often":
+            s = s[(s >= 1200.0) & (s < 1800.0)]
+        s += draw.uniform(0.0, min(0.05 * interval_s, 1.0), len(s))
+        x_m = s / 20.0 if name == "ten" else np.full(len(s), 1000.0 if name == "five" else number % 2)
+        columns.append(np.array([np.full(len(s), number), 1000 * s, 1000 * x_m, np.zeros(len(s))]).round().astype(int))
+    tag, ms, x_mm, y_mm = np.concatenate(columns, axis=1)[:, np.argsort(np.concatenate(columns, axis=1)[1])]
+    rows = {"tag": tag, "t": round(1000 * MIDNIGHT) + ms, "x_mm": x_mm, "y_mm": y_mm}
+    rows |= {name: np.full(len(tag), 10) for name in FIX_COLUMNS if name not in rows}
+    for first in range(1, len(tag) + 1, request.param):
+        write_fixes(site, rows, first, min(first + request.param - 1, len(tag)))
+    names = {"tag": [*range(1, 6)], "name": [*intervals_s], "since": [0] * 5}
     parquet.write_table(arrow_table(NAME_COLUMNS, names), site / "names.parquet")
-    history, span = History(tmp_path, 2), Span(MIDNIGHT, MIDNIGHT + 3600.0)
-    assert sum(history.heatmap(span, tags=("rest",)).seconds) == pytest.approx(59 * 60.0)
-    assert history.track("moving", span).length_m == pytest.approx(0.5 * (6 * minutes - 1))
-    assert history.contacts("rest", span, 2.0) == (
-        Contact("rest", "near", MIDNIGHT + 600.0, MIDNIGHT + 19 * 60.0 + 10.0, 1.5),
-    )
+    return History(tmp_path, 2)
+
+
+def test_fixes_of_tags_that_send_rarely_count_until_the_next_one(sleepers):
+    span = Span(MIDNIGHT, MIDNIGHT + 3600.0)
+    for tag in ("minute", "ten", "bursts", "five", "often"):
+        track = sleepers.track(tag, span)
+        seconds = sum(sleepers.heatmap(span, tags=(tag,)).seconds)
+        assert seconds == pytest.approx(track.points[-1].unix_s - track.points[0].unix_s)
+        assert seconds > {"five": 3290.0, "often": 598.0}.get(tag, 3530.0)
+        assert track.gap_s == {"five": 900.0, "often": 10.0}.get(tag, track.gap_s)
+        assert track.length_m == pytest.approx(179.0 if tag == "ten" else 0.0, abs=3.0)
+
+
+def test_contacts_of_tags_that_send_rarely(sleepers):
+    span = Span(MIDNIGHT, MIDNIGHT + 3600.0)
+    for one, other, begin_s, end_s, known_s in (
+        ("minute", "bursts", 0, 3600, 60),
+        ("bursts", "minute", 0, 3600, 60),
+        ("minute", "often", 1200, 1800, 60),
+        ("often", "bursts", 1200, 1800, 60),
+        ("bursts", "ten", 0, 30, 60),
+    ):
+        (contact,) = [found for found in sleepers.contacts(one, span, 2.0) if found.other == other]
+        assert contact.begin_unix_s - MIDNIGHT == pytest.approx(begin_s, abs=known_s)
+        assert contact.end_unix_s - MIDNIGHT == pytest.approx(end_s, abs=known_s)
+    assert not any("five" in (found.tag, found.other) for found in sleepers.contacts("minute", span, 2.0))
 
 
 def test_sql_sees_every_fix_of_the_range(history, within, tmp_path):

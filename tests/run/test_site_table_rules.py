@@ -234,12 +234,15 @@ def test_a_status_or_health_beyond_the_limit_of_names_is_nobody_s(monkeypatch):
     assert table.roster.admits("tag", "t2") is False
 
 
-def test_a_fix_shows_which_anchors_are_in_use():
+def test_an_anchor_is_used_while_the_newest_fix_that_used_it_is_fresh():
     table = SiteTable(0.0)
     table.add_health("anchor", "2", anchor_health(2), 0.0)
-    for now_s in (1.0, 2.0):
-        table.add_fix(fix(anchors=(1, 2)), now_s)
-        assert [(name, node.used_s) for name, node in table.senders("anchor")] == [("1", now_s), ("2", now_s)]
+    table.add_health("tag", "rare", tag_health("rare", interval_s=10.0), 2.0)
+    for tag, now_s, fresh_s in (("often", 1.0, THRESHOLDS.fresh_s), ("rare", 2.0, 10.0 * THRESHOLDS.fresh_intervals)):
+        table.add_fix(fix(tag, anchors=(1, 2)), now_s)
+        for _, anchor in table.senders("anchor"):
+            assert [table.is_used(anchor, now_s + fresh_s + late_s) for late_s in (-0.01, 0.01)] == [True, False]
+    assert [name for name, _ in table.senders("anchor")] == ["1", "2"]
 
 
 def test_nodes_are_in_natural_order():

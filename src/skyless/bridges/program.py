@@ -33,12 +33,11 @@ from skyless.run.mqtt.messages import (
 )
 from skyless.run.process import HEALTH_S, Log, every, keep, together
 from skyless.run.site_feed import SiteFeed
+from skyless.run.site_table import THRESHOLDS
 from skyless.run.zones import zones_of
 
 if TYPE_CHECKING:  # it compiles kernels, which a bridge of a broker does not need
     from skyless.core.tag.receiver import SiteListener
-
-_SILENT_S: Final = 5.0  # after so long without a fix a line says where to look
 
 _GEOREFERENCE_S: Final = 5.0
 """If the site sends a georeference, a tag has it this long after the other pages, which come in turn."""
@@ -132,10 +131,13 @@ class BridgeNode:
         self.hub.on_tick(now_s, time.time())
         if not self.link.connected:
             self._last_fix_s = now_s  # tags, too, need a moment to find a broker that is back
-        if not self._is_silent and now_s - self._last_fix_s > _SILENT_S:
+        table, silent_s = self.hub.table, now_s - self._last_fix_s
+        if self._is_silent or silent_s < THRESHOLDS.grace_s:
+            return
+        if not any(table.presence(tag, now_s) in ("fresh", "asleep") for tag in table.fixed.values()):
             self._is_silent = True
             known = "no tag publishes fixes" if self._site is not None else "the site itself is not on the broker"
-            self._log(f"no fix for {_SILENT_S:g} s: {known}; skyless dashboard shows why")
+            self._log(f"no fix for {silent_s:.0f} s: {known}; skyless dashboard shows why")
 
 
 def _name(hub: Hub) -> str:

@@ -9,7 +9,6 @@ from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
 
-from skyless.run.history.answers import THINNED_GAP_S
 from skyless.site.report import BLUE, MAP, MUTED, panel, report_style
 
 _BARS: Final = 30
@@ -26,7 +25,7 @@ def track_figure(track: _Answer, zones: _Zones, title: str) -> Figure:
         figure, axes = panel(f"{track['tag_name']}, {title}", 4.2)
         rows = np.array([(point.unix_s, point.x_m, point.y_m) for point in track["points"]]).reshape(-1, 3)
         usual_s = np.median(np.diff(rows[:, 0])) if len(rows) > 1 else 0.0
-        gaps = np.flatnonzero(np.diff(rows[:, 0]) > max(THINNED_GAP_S, 3.0 * usual_s)) + 1
+        gaps = np.flatnonzero(np.diff(rows[:, 0]) > max(track["gap_s"], 3.0 * usual_s)) + 1
         for part in np.split(rows, gaps):
             axes.plot(part[:, 1], part[:, 2], ".-", color=BLUE, markersize=1.5, linewidth=0.7)
         _plan(axes, zones)

@@ -27,13 +27,12 @@ from skyless.run.gather.subjects import NatsAddress, connect, rarely
 from skyless.run.hub_files import Hub, Leaf, StuckLineError
 from skyless.run.mqtt.link import Handler, Subscriptions
 from skyless.run.process import Log, together
+from skyless.run.site_table import THRESHOLDS
 
 if TYPE_CHECKING:
     from nats.aio.client import Client
     from nats.aio.msg import Msg
 
-SILENT_S: Final = 5.0
-"""A site counts as disconnected when its gather has not been heard for this long."""
 _CHECK_S: Final = 0.5
 _KEPT: Final = (*subjects.STATE, *subjects.EVENTS, subjects.JSON_FIXES)
 """Subjects in streams, which are not read live; fixes come as batches."""
@@ -106,7 +105,7 @@ class HubLink:
         while True:
             if not client.is_connected:
                 self._set_state(f"the hub {self.address} cannot be reached")
-            elif time.monotonic() - self._heard_s > SILENT_S:
+            elif time.monotonic() - self._heard_s > THRESHOLDS.site_s:
                 self._set_state(f"site {self.site} is not heard: its line to the hub is cut, or no gather runs there")
             else:
                 self._set_state(None)
@@ -331,7 +330,7 @@ class HubSites:
                 return HubSite(number, name, "unknown", "waiting for its gather")
             return HubSite(number, name, "cut", f"not heard for {_lasting(now_s - self._began_s)} or longer")
         heard_s, unix_s, summary = self._heard[number]
-        if now_s - heard_s > SILENT_S:
+        if now_s - heard_s > THRESHOLDS.site_s:
             return HubSite(number, name, "cut", f"not heard for {_lasting(now_s - heard_s)}", heard_unix_s=unix_s)
         condition: Literal["bad", "degraded", "unknown", "good"]
         match summary.condition:

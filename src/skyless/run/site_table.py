@@ -41,9 +41,15 @@ class Thresholds(Struct, frozen=True):
     """Programs report once a second; one that has been silent for longer is offline, whatever its status says."""
     grace_s: float = 5.0
     """What has just started, or a connection just made, may be incomplete for this long."""
+    site_s: float = 5.0
+    """A site reports to its hub once a second, over a line that may be slow; after this time it is cut off."""
     watch_s: float = 30.0
     """The watch of the anchors reports every 10 s at least."""
     forgotten_s: float = 86_400.0
+
+    def gone_after_s(self, interval_s: float, longest_s: float) -> float:
+        """How long a tag with this interval must be silent to be gone."""
+        return min(max(self.gone_s, self.gone_intervals * interval_s), longest_s)
 
 
 THRESHOLDS: Final = Thresholds()
@@ -62,14 +68,14 @@ _SET_BACK_S: Final = 10.0
 """A fix older than the newest by more than this is of a clock that was set back; others that are older are late."""
 
 # A tag's own interval, from its gaps. Only gaps that can change an answer are kept; shorter ones change nothing.
-_SHORT_S: Final = 1.5
+SHORT_GAP_S: Final = 1.5
 _MAX_GAPS: Final = 8
 _KNOWN_S: Final = 10.0
 """The interval of a tag heard for a shorter time is unknown: it may send in bursts, with long silence between them."""
 _LEARN_S: Final = 1.0  # shortest time between two looks at the gaps of a tag that sends often
 _MEMORY: Final = 10.0
 """A gap is remembered for this many times its length."""
-_SHARE: Final = 0.15
+RHYTHM_SHARE: Final = 0.15
 """Gaps that fill this share of the remembered time are the tag's rhythm. A single gap of a tag that has been heard for
 long fills 10 %, and is an outage."""
 _ALIKE: Final = 0.8
@@ -91,7 +97,7 @@ class Node:
     __slots__ = (
         *("asleep_until_s", "codes_s", "ended_unix_s", "first_s", "fix", "fix_s", "gaps"),
         *("health", "health_s", "health_serial", "heard_s", "is_due", "is_gone", "learn_s", "learnt_s"),
-        *("name", "previous", "row", "sends", "serial", "since_s", "stated_s", "status", "status_serial", "used_s"),
+        *("name", "previous", "row", "sends", "serial", "since_s", "stated_s", "status", "status_serial", "used"),
     )
 
     def __init__(self, name: str) -> None:
@@ -114,7 +120,7 @@ class Node:
         self.learn_s = float("-inf")  # time when they are looked at again, besides after each gap
         self.stated_s = 0.0  # the interval that the tag states
         self.asleep_until_s = float("-inf")
-        self.used_s = float("-inf")  # time of the last fix that used this anchor
+        self.used: tuple[float, Node] | None = None  # arrival of the last fix that used this anchor, and its tag
         self.codes_s: float | None = None  # time since when it states that its beacons have codes
         self.serial = self.health_serial = self.status_serial = 0
         """Count of the table at the last change, for readers that want what is new."""
@@ -157,7 +163,7 @@ class Node:
         gap_s, self.fix_s = now_s - max(self.fix_s, ready_s, self.asleep_until_s), now_s
         if self.heard_s is None:
             self.heard_s = now_s
-        elif _SHORT_S < gap_s <= longest_s:
+        elif SHORT_GAP_S < gap_s <= longest_s:
             self.gaps, self.learn_s = [*self.gaps[1 - _MAX_GAPS :], _Gap(now_s, gap_s, self.is_gone)], now_s
         if self.is_gone:
             self.is_gone, self.first_s = False, now_s
@@ -173,7 +179,7 @@ class Node:
         span_s = min(_MEMORY * gap_s, now_s - self.heard_s)
         alike = [gap for gap in self.gaps if gap.length_s >= _ALIKE * gap_s and now_s - gap.end_s <= span_s]
         is_absence = len(alike) == 1 and alike[0].was_gone
-        return not is_absence and sum(gap.length_s for gap in alike) >= _SHARE * span_s
+        return not is_absence and sum(gap.length_s for gap in alike) >= RHYTHM_SHARE * span_s
 
 
 class SiteTable:
@@ -333,13 +339,13 @@ class SiteTable:
         node.fix = fix
         self.fixed[fix.tag] = node
         self._changed(node)
-        anchors = self._nodes["anchor"]
+        anchors, now_used = self._nodes["anchor"], (now_s, node)
         for anchor in map(str, fix.anchors):
             used = anchors.get(anchor)
             if used is None or not used.sends:
                 used = self.add("anchor", anchor, sends=True)
             if used is not None:
-                used.used_s = now_s
+                used.used = now_used
         return node
 
     def hear(self, tags: Iterable[str], now_s: float) -> dict[str, float]:
@@ -350,7 +356,7 @@ class SiteTable:
         known, rare = self._nodes["tag"], {}
         for name in tags:
             node = known.get(name)
-            if node is None or node.is_gone or node.gaps or now_s - node.fix_s > _SHORT_S:
+            if node is None or node.is_gone or node.gaps or now_s - node.fix_s > SHORT_GAP_S:
                 node = self.add("tag", name)
                 if node is not None:
                     self._note(node, now_s)
@@ -418,23 +424,23 @@ class SiteTable:
 
     def fresh_for_s(self, tag: Node) -> float:
         """For how long a fix of a tag is fresh."""
+        if not tag.gaps and not tag.stated_s:  # the usual case
+            return THRESHOLDS.fresh_s
         interval_s = tag.interval_s or 0.0
         return min(max(THRESHOLDS.fresh_s, THRESHOLDS.fresh_intervals * interval_s), self.longest_silence_s(tag))
 
     def gone_after_s(self, tag: Node) -> float:
         """For how long a tag must be silent to be gone."""
-        longest_s = self.longest_silence_s(tag)
-        interval_s = tag.interval_s
-        if interval_s is None:
-            return longest_s
-        return min(max(THRESHOLDS.gone_s, THRESHOLDS.gone_intervals * interval_s), longest_s)
+        interval_s, longest_s = tag.interval_s, self.longest_silence_s(tag)
+        return longest_s if interval_s is None else THRESHOLDS.gone_after_s(interval_s, longest_s)
 
     def is_fresh(self, tag: Node, now_s: float) -> bool:
         """Whether a tag's newest fix is fresh, and its program has not ended since."""
-        age_s = now_s - tag.fix_s
-        if tag.is_gone or age_s < THRESHOLDS.fresh_s:
-            return not tag.is_gone
-        return (bool(tag.gaps) or tag.stated_s > 0.0) and age_s < self.fresh_for_s(tag)
+        return not tag.is_gone and now_s - tag.fix_s < self.fresh_for_s(tag)
+
+    def is_used(self, anchor: Node, now_s: float) -> bool:
+        """Whether the newest fix that used an anchor is fresh."""
+        return anchor.used is not None and now_s - anchor.used[0] < self.fresh_for_s(anchor.used[1])
 
     def is_there(self, tag: Node, now_s: float) -> bool:
         """Whether a tag has had a fix and is not gone."""

@@ -173,7 +173,7 @@ def history(kind, query):
         times = [at for n in range(int(query["points"])) if (at := from_s + n * step_s) % PERIOD_S >= PAUSE_S]
         places = [truth(names(2).index(tag), at % 86_400.0)[:2] for at in times]
         rows = [[at, round(x, 3), round(y, 3), 1.2, 0.05, 0.4, None] for at, (x, y) in zip(times, places, strict=True)]
-        return {"tag": tag, "points": rows, "fixes": 10 * len(rows), "length_m": 321.0}, 200
+        return {"tag": tag, "points": rows, "fixes": 10 * len(rows), "length_m": 321.0, "gap_s": 10.0}, 200
     if kind == "heatmap":
         cell_m, columns, rows = float(query["cell_m"]), 8, 5
         seconds = [0.0 if n % 3 else 0.5 * 1.2**n for n in range(columns * rows)]

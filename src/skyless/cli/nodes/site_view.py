@@ -218,7 +218,9 @@ class SiteView:
             trouble=self.link.trouble,
             condition=self.condition,
             tags=self._tag_rows(tags, now_s),
-            anchors=tuple(sorted((_anchor_row(*one, now_s) for one in named), key=lambda row: row.state not in GONE)),
+            anchors=tuple(
+                sorted((self._anchor_row(*one, now_s) for one in named), key=lambda row: row.state not in GONE)
+            ),
             alarms=tuple(sorted(self._alarms.values(), key=_alarm_rank)),
             drops={reason: count for reason, count in drops.most_common() if count and reason not in NOT_DROPS},
             unused=dict(self.feed.drops),
@@ -239,17 +241,16 @@ class SiteView:
             rows.append(TagRow(name, state, age_s, tag.fix, health, assets[name].name if name in assets else ""))
         return tuple(sorted(rows, key=_tag_rank))
 
-
-def _anchor_row(name: str, node: Node, now_s: float) -> AnchorRow:
-    health = node.health if isinstance(node.health, AnchorHealth) else None
-    state = "silent"
-    if node.online is False:
-        state = "offline"
-    elif health is None and now_s - node.used_s < THRESHOLDS.fresh_s:
-        state = "used"
-    elif health is not None and node.reports(now_s):
-        state = health.role
-    return AnchorRow(name, state, None if health is None else now_s - node.health_s, health)
+    def _anchor_row(self, name: str, node: Node, now_s: float) -> AnchorRow:
+        health = node.health if isinstance(node.health, AnchorHealth) else None
+        state = "silent"
+        if node.online is False:
+            state = "offline"
+        elif health is None and self.table.is_used(node, now_s):
+            state = "used"
+        elif health is not None and node.reports(now_s):
+            state = health.role
+        return AnchorRow(name, state, None if health is None else now_s - node.health_s, health)
 
 
 def _tag_rank(row: TagRow) -> int:

@@ -16,8 +16,7 @@ const AT_EVENT_S = 0.3;
 const LEAD_S = 1.0;
 /** Levels of events that have a mark on the bar. */
 const MARKED = new Set(["warning", "bad"]);
-/** Points of a way are joined up to this time, as in the server's answers, or a multiple of their usual step: they are thinned. */
-const MIN_GAP_S = 15;
+/** Points of a way are joined up to the server's gap, or a multiple of their usual step: they are thinned. */
 const GAP_STEPS = 3;
 /** Multiples of real time. */
 export const SPEEDS = { recording: [0.25, 0.5, 1, 2, 4, 8], way: [1, 4, 16, 60, 300, 1000], heat: [] };
@@ -52,7 +51,7 @@ export function showWay(track, title) {
   const start_unix_s = track.points[0][0];
   const times = track.points.map(([unix_s]) => unix_s - start_unix_s);
   const steps = Float64Array.from(times.slice(1), (at, index) => at - times[index]).sort();
-  const gap_s = Math.max(MIN_GAP_S, GAP_STEPS * (steps[steps.length >> 1] ?? 0));
+  const gap_s = Math.max(track.gap_s, GAP_STEPS * (steps[steps.length >> 1] ?? 0));
   const fixes = [];
   times.forEach((at, index) => {
     if (index && at - times[index - 1] <= gap_s) fixes.at(-1)[1] = at;

@@ -10,10 +10,6 @@ from msgspec import Struct
 
 from skyless.core.errors import SkylessError
 
-GAP_S: Final = 5.0
-THINNED_GAP_S: Final = 65.0
-"""How long a tag's position counts after its last fix in days that are thinned, where there may be one fix a minute."""
-
 
 class Span(Struct, frozen=True):
     """A time range, its end excluded."""
@@ -42,8 +38,10 @@ class Track(Struct, frozen=True):
     fixes: int
     """Number of fixes in the range; more than points if the track was thinned."""
     length_m: float
-    """Length in the plane through all fixes, without gaps of more than ``GAP_S`` (``THINNED_GAP_S``). Moves of less
-    than a quarter of a metre, or three standard deviations, may be noise: they count only once they add up to that."""
+    """Length in the plane through all fixes, without gaps. Moves of less than a quarter of a metre, or three standard
+    deviations, may be noise: they count only once they add up to that."""
+    gap_s: float
+    """A longer time without a fix is a gap: the tag, which may send rarely, would be gone by then."""
 
 
 class Heatmap(Struct, frozen=True):

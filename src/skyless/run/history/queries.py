@@ -6,8 +6,9 @@ DuckDB reads the files. Rows that are in no file yet, from the last ten minutes 
 import contextlib
 import math
 from array import array
+from bisect import bisect_left
 from collections import defaultdict
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from datetime import UTC, datetime, timedelta
 from functools import wraps
 from itertools import chain
@@ -23,13 +24,12 @@ from skyless.arguments import check_number
 from skyless.core.errors import SkylessError
 from skyless.files import whole_file
 from skyless.run.fix_batch import ALERT_BITS, ALERTS, NONE_U16, SIMULATED
-from skyless.run.history.answers import GAP_S, THINNED_GAP_S, Contact, Dwell, Heatmap, Span, Track, TrackPoint
+from skyless.run.history.answers import Contact, Dwell, Heatmap, Span, Track, TrackPoint
 from skyless.run.history.layout import (
     ASSET_COLUMNS,
     EVENT_COLUMNS,
     FIX_COLUMNS,
     NAME_COLUMNS,
-    THINNED,
     ZONE_COLUMNS,
     current_events,
     current_files,
@@ -42,12 +42,12 @@ from skyless.run.history.tables import (
     check_readable,
     connection,
     database,
-    metadata_in,
     pattern,
     quoted,
     read_rows,
     select,
 )
+from skyless.run.site_table import RHYTHM_SHARE, SHORT_GAP_S, THRESHOLDS
 from skyless.run.web import HISTORY as LIMITS
 
 # Times in cells and contacts need all rows: NumPy takes a third of DuckDB's processor time here.
@@ -59,40 +59,38 @@ _OUTSIDE: Final = _SIDE * _SIDE
 _WILD_SHARE: Final = 1e-3
 """Largest share of the time that wild fixes outside the grid may account for."""
 
+_GAP_BITS: Final = 10  # of a gap in whole seconds, beside its tag
+_LEAST_GAPS: Final = 3
+
 _ScanInts = NDArray[Any]
 
 
 def time_in_cells(files: Sequence[Path], span: Span, cell_mm: int, tags: Collection[int] | None) -> Heatmap:
     """Return how long tags were in each cell of a grid; ``tags`` None means all. Raises SkylessError, duckdb.Error.
 
-    A fix counts until the tag's next one in the range, up to ``GAP_S``, or ``THINNED_GAP_S`` in a thinned file. The
+    A fix counts until the tag's next one in the range, or until the tag would be gone (``run/site_table.py``). The
     tag's last fix does not count.
     """
     sums_ms = np.zeros(_OUTSIDE + 1, np.int64)
-    edges = [np.empty((4, 0), np.int64)]
-    """First and last fix of each tag in each batch. Rows: tag, time, longest time that the fix may count (0 for a first
-    one), cell."""
     corner: list[int] = []
-    for (tag, t, x, y), gap_ms in fixes_in(files, span, tags):
-        places = x // cell_mm, y // cell_mm
-        corner = corner or [int(np.median(one)) - _SIDE // 2 for one in places]
-        column, row = ((one - first).view(np.uint32) for one, first in zip(places, corner, strict=True))
-        cell = (row * np.uint32(_SIDE) + column).astype(np.intp)
-        if column.max() >= _SIDE or row.max() >= _SIDE:  # negative ones are large as unsigned numbers
-            cell[(column >= _SIDE) | (row >= _SIDE)] = _OUTSIDE
-        changes = np.flatnonzero(tag[1:] != tag[:-1])
-        ms = np.minimum(t[1:] - t[:-1], gap_ms)
-        ms[changes] = 0
-        np.add.at(sums_ms, cell[:-1], ms)  # fast for these types only
-        at = np.concatenate([[0], changes + 1, changes, [len(tag) - 1]])
-        edges.append(np.array([tag[at], t[at], np.repeat([0, gap_ms], len(at) // 2), cell[at]]))
-    ends = np.concatenate(edges, axis=1)
-    tag, t, most_ms, cell = ends[:, np.lexsort((ends[2], ends[1], ends[0]))]
-    joined = np.flatnonzero((most_ms[:-1] > 0) & (most_ms[1:] == 0) & (tag[1:] == tag[:-1]))
-    np.add.at(sums_ms, cell[joined], np.minimum(np.diff(t), most_ms[:-1])[joined])
+
+    def cells() -> Iterator[list[_ScanInts]]:
+        for tag, t, x, y in fixes_in(files, span, tags, "x_mm", "y_mm"):
+            places = x // cell_mm, y // cell_mm
+            corner[:] = corner or [int(np.median(one)) - _SIDE // 2 for one in places]
+            column, row = ((one - first).view(np.uint32) for one, first in zip(places, corner, strict=True))
+            cell = (row * np.uint32(_SIDE) + column).astype(np.intp)
+            if column.max() >= _SIDE or row.max() >= _SIDE:  # negative ones are large as unsigned numbers
+                cell[(column >= _SIDE) | (row >= _SIDE)] = _OUTSIDE
+            yield [tag, t, cell]
+
+    intervals_s = intervals_in(files, span, tags)
+    counts_ms = _by_tag({tag: gone_after_ms(interval_s) for tag, interval_s in intervals_s.items()})
+    for (tag, _, cell), gap_ms in with_gaps(cells()):
+        np.add.at(sums_ms, cell, np.minimum(gap_ms, counts_ms(tag)))  # fast for these types only
     if sums_ms[_OUTSIDE] > _WILD_SHARE * sums_ms.sum():
         raise SkylessError(f"cells of {1e-3 * cell_mm:g} m are too many; choose larger ones")
-    grid, number, cell_m = sums_ms[:_OUTSIDE].reshape(_SIDE, _SIDE), len(np.unique(tag)), 1e-3 * cell_mm
+    grid, number, cell_m = sums_ms[:_OUTSIDE].reshape(_SIDE, _SIDE), len(intervals_s), 1e-3 * cell_mm
     columns, rows = np.flatnonzero(grid.any(axis=0)), np.flatnonzero(grid.any(axis=1))
     if not len(rows):
         return Heatmap(0.0, 0.0, cell_m, 0, 0, (), number)
@@ -104,16 +102,87 @@ def time_in_cells(files: Sequence[Path], span: Span, cell_mm: int, tags: Collect
     return Heatmap(x0_m, y0_m, cell_m, grid.shape[1], grid.shape[0], tuple((1e-3 * grid.ravel()).tolist()), number)
 
 
+def with_gaps(batches: Iterable[list[_ScanInts]]) -> Iterator[tuple[list[_ScanInts], _ScanInts]]:
+    """Yield fixes, of which the first columns are tags and times in ms, with the time until the same tag's next one.
+
+    The last fix of a tag in a batch has 0 there, and comes again at the end if the next one is in another batch.
+    """
+    edges: list[list[_ScanInts]] = []
+    for batch in batches:
+        tag, t = batch[:2]
+        is_last = np.append(tag[1:] != tag[:-1], True)
+        gap_ms = np.append(t[1:] - t[:-1], 0)
+        gap_ms[is_last] = 0
+        yield batch, gap_ms
+        for is_edge, is_end in ((np.append(True, is_last[:-1]), False), (is_last, True)):
+            edges.append([*(column[is_edge] for column in batch), np.full(np.count_nonzero(is_edge), is_end)])
+    if edges:
+        columns = [np.concatenate(parts) for parts in zip(*edges, strict=True)]
+        order = np.lexsort((columns[-1], columns[1], columns[0]))
+        tag, t, *others, ends = (column[order] for column in columns)
+        pairs = np.flatnonzero(ends[:-1] & ~ends[1:] & (tag[1:] == tag[:-1]))
+        if len(pairs):
+            yield [column[pairs] for column in (tag, t, *others)], np.diff(t)[pairs]
+
+
+def intervals_in(
+    files: Sequence[Path], span: Span, tags: Collection[int] | None, share: float = RHYTHM_SHARE
+) -> dict[int, int]:
+    """Return each tag's own interval in seconds, 0 if it is short. Raises duckdb.Error.
+
+    Nearly as ``run/site_table.py`` learns it: the longest gap such that it and longer ones, three at least, fill a
+    share of the tag's time in the range. Gaps in which any tag would be gone are absences.
+    """
+    heard: list[tuple[_ScanInts, _ScanInts]] = []  # tags, and times in ms without absences
+    gaps: list[tuple[_ScanInts, _ScanInts]] = []  # tags with lengths in s, and numbers of such gaps
+    for (tag, *_), gap_ms in with_gaps(fixes_in(files, span, tags)):
+        gap_ms[gap_ms > 1000.0 * THRESHOLDS.longest_s] = 0
+        first = np.flatnonzero(np.append(True, tag[1:] != tag[:-1]))
+        heard.append((tag[first], np.add.reduceat(gap_ms, first)))
+        is_long = gap_ms > 1000.0 * SHORT_GAP_S
+        lengths_s = np.rint(1e-3 * gap_ms[is_long]).astype(np.int64)
+        gaps.append(np.unique((tag[is_long].astype(np.int64) << _GAP_BITS) + lengths_s, return_counts=True))
+    known_ms = dict(zip(*(column.tolist() for column in _sums(heard)), strict=True))
+    found = dict.fromkeys(known_ms, 0)
+    keys, counts = _sums(gaps)
+    if not len(keys):
+        return found
+    changes = np.flatnonzero(np.diff(keys >> _GAP_BITS)) + 1
+    for key, count in zip(np.split(keys, changes), np.split(counts, changes), strict=True):
+        number, length_s = int(key[0]) >> _GAP_BITS, key & ((1 << _GAP_BITS) - 1)
+        longer, longer_s = (np.cumsum(one[::-1])[::-1] for one in (count, count * length_s))
+        is_usual = (longer >= _LEAST_GAPS) & (1000 * longer_s >= share * known_ms[number])
+        found[number] = int(length_s[is_usual].max(initial=0))
+    return found
+
+
+def _sums(parts: Sequence[tuple[_ScanInts, _ScanInts]]) -> tuple[_ScanInts, _ScanInts]:
+    """Sorted keys of all parts, each once, with the sum of its values."""
+    nothing = np.empty(0, np.int64)
+    keys, values = (np.concatenate(columns) for columns in zip((nothing, nothing), *parts, strict=True))
+    found, at = np.unique(keys, return_inverse=True)
+    return found, np.bincount(at, values, len(found)).astype(np.int64)
+
+
+def _by_tag(values: Mapping[int, int]) -> Callable[[_ScanInts], _ScanInts]:
+    """Return a function that looks up the values of tags."""
+    tags, found = (np.array(column) for column in zip((-1, 0), *sorted(values.items()), strict=True))
+    if len({*values.values()}) < 2:  # usually; looking up costs as much as the sums
+        return lambda _: found[-1]
+    return lambda tag: found[np.searchsorted(tags, tag)]
+
+
 def near(
-    files: Sequence[Path], span: Span, own: Collection[int], bucket_ms: int, distance_mm: int, gap: int
+    files: Sequence[Path], span: Span, own: Collection[int], bucket_s: int, distance_mm: int, others: Collection[int]
 ) -> NDArray[np.int64]:
-    """Find when other tags were near the tag with the numbers ``own``.
+    """Find when tags with the numbers ``others`` were near the tag with the numbers ``own``.
 
     Returns a row each for tags, first and last buckets of time, and least squared distances. Of ``own``, the first fix
-    in a bucket is compared. ``gap`` is the largest number of buckets between those of one contact. Raises duckdb.Error.
+    in a bucket is compared. Raises duckdb.Error.
     """
     firsts: list[tuple[_ScanInts, ...]] = []
-    for (_, t, x, y), _ in fixes_in(files, span, own):
+    bucket_ms = 1000 * bucket_s
+    for _, t, x, y in fixes_in(files, span, own, "x_mm", "y_mm"):
         nth = np.unique(t // bucket_ms, return_index=True)[1]
         firsts.append((t[nth], x[nth], y[nth]))
     if not firsts:
@@ -124,21 +193,21 @@ def near(
     buckets, nth = np.unique(times[order] // bucket_ms, return_index=True)
     x0, y0 = (column[order[nth]].astype(np.int64) for column in places)
     runs: list[NDArray[np.int64]] = []
-    for (tag, t, x, y), _ in fixes_in(files, span, None):
+    for tag, t, x, y in fixes_in(files, span, None, "x_mm", "y_mm"):
         bucket = t // bucket_ms
         at = np.searchsorted(buckets, bucket).clip(max=len(buckets) - 1)
         rows = np.flatnonzero((np.abs(x - x0[at]) <= distance_mm) & (buckets[at] == bucket))
-        rows = rows[(np.abs(y[rows] - y0[at[rows]]) <= distance_mm) & ~np.isin(tag[rows], list(own))]
+        rows = rows[(np.abs(y[rows] - y0[at[rows]]) <= distance_mm) & np.isin(tag[rows], list(others))]
         square = (x[rows] - x0[at[rows]]) ** 2 + (y[rows] - y0[at[rows]]) ** 2
         found = np.array([tag[rows], bucket[rows], bucket[rows], square], np.int64)
-        runs.append(joined([found[:, square <= distance_mm**2]], gap))
+        runs.append(joined([found[:, square <= distance_mm**2]]))
         if sum(one.shape[1] for one in runs) > 2 * LIMITS.contacts:
-            runs = [joined(runs, gap)]
-    return joined(runs, gap)
+            runs = [joined(runs)]
+    return joined(runs)
 
 
-def joined(parts: Sequence[NDArray[np.int64]], gap: int) -> NDArray[np.int64]:
-    """Join runs of buckets of the same tag with at most ``gap`` buckets between them.
+def joined(parts: Sequence[NDArray[np.int64]]) -> NDArray[np.int64]:
+    """Join runs of buckets of the same tag with at most ``_PAUSE`` buckets between them.
 
     Raises SkylessError if there are too many.
     """
@@ -147,9 +216,9 @@ def joined(parts: Sequence[NDArray[np.int64]], gap: int) -> NDArray[np.int64]:
         return runs
     tag, first, last, square = runs[:, np.lexsort((runs[1], runs[0]))]
     is_other = np.append(True, tag[1:] != tag[:-1])
-    later = np.cumsum(is_other) * (last.max() - first.min() + gap + 2)  # each tag after the one before
+    later = np.cumsum(is_other) * (last.max() - first.min() + _PAUSE + 2)  # each tag after the one before
     until = np.maximum.accumulate(last + later)
-    begins = np.flatnonzero(np.append(True, (first + later)[1:] > until[:-1] + gap + 1))
+    begins = np.flatnonzero(np.append(True, (first + later)[1:] > until[:-1] + _PAUSE + 1))
     if len(begins) > LIMITS.contacts:
         raise SkylessError("the contacts are too many; choose a shorter range or a smaller distance")
     return np.array(
@@ -157,18 +226,20 @@ def joined(parts: Sequence[NDArray[np.int64]], gap: int) -> NDArray[np.int64]:
     )
 
 
-def fixes_in(files: Sequence[Path], span: Span, tags: Collection[int] | None) -> Iterator[tuple[list[_ScanInts], int]]:
-    """Yield batches of fixes (tags, times in ms, x and y in mm), each with the longest time in ms that a fix counts."""
+def fixes_in(
+    files: Sequence[Path], span: Span, tags: Collection[int] | None, *places: str
+) -> Iterator[list[_ScanInts]]:
+    """Yield fixes by tag and time, in batches: columns of tags, of times in ms and of ``places``."""
     begin_ms, end_ms = (math.ceil(round(1000.0 * unix_s, 2)) for unix_s in (span.from_unix_s, span.to_unix_s))
-    kinds = {name: FIX_COLUMNS[name] for name in ("tag", "t", "x_mm", "y_mm")}
+    kinds = {name: FIX_COLUMNS[name] for name in ("tag", "t", *places)}
     wanted = f"t >= make_timestamptz({1000 * begin_ms}) AND t < make_timestamptz({1000 * end_ms})"
-    wanted += f" AND {_KNOWN}" + ("" if tags is None else f" AND tag IN ({', '.join(map(str, tags))})")
+    wanted += "".join(f" AND {name} NOT NULL" for name in ("tag", *places))
+    wanted += "" if tags is None else f" AND tag IN ({', '.join(map(str, tags))})"
     with connection() as duck:
-        for file, metadata in metadata_in(duck, files).items():
-            gap_ms = round(1000.0 * (THINNED_GAP_S if THINNED in metadata else GAP_S))
+        for file in files:
             columns = [*select(duck, [file], kinds, wanted).fetchnumpy().values()]
             for first in range(0, len(columns[0]), ROW_GROUP):  # in parts, which needs less memory
-                yield [column[first : first + ROW_GROUP] for column in columns], gap_ms
+                yield [column[first : first + ROW_GROUP] for column in columns]
 
 
 _EARLY: Final = timedelta(hours=1)
@@ -185,9 +256,12 @@ _TRIES: Final = 3
 _MOVE_M: Final = 0.25
 _MOVE_SIGMAS: Final = 3.0
 """Shorter moves, in standard deviations of the fix, may be noise and do not lengthen a track."""
-_CONTACT_MS: Final = {False: (1000, 5), True: (10_000, 6)}
-"""Length in ms of the intervals in which fixes are compared, and longest interruption of a contact in such intervals,
-by whether days are thinned."""
+_BUCKETS_S: Final = (1, 2, 5, 10, 30, 60, 120, 300, 900)
+"""Lengths of the intervals in which fixes are compared: the shortest that is no shorter than the tags' own ones."""
+_CONTACT_SHARE: Final = 0.5
+"""A tag sends rarely, for contacts, if it does so for this share of its time: longer intervals are less exact."""
+_PAUSE: Final = 5
+"""The longest interruption of a contact, in such intervals."""
 _PART_S: Final = 28.0 * 86_400.0
 _NAMED: Final = 5
 """How many known names an error lists."""
@@ -325,10 +399,12 @@ class History:
         ((tag, numbers),) = self._tags((tag,)).items()
         check_number("the number of points", most_points, least=2, most=LIMITS.points)
         files, own = self._files(span), f"{_FIXES} AND tag IN ({', '.join(map(str, numbers))})"
-        gap_ms = round(1000 * (THINNED_GAP_S if _are_thinned(files) else GAP_S))
-        ((count,),) = _stream(f"SELECT count(*) FROM ({own})", files, span) if files else ((0,),)
+        if not files:
+            return Track(tag, (), 0, 0.0, 0.0)
+        ((count,),) = _stream(f"SELECT count(*) FROM ({own})", files, span)
+        gap_ms = gone_after_ms(max(intervals_in(files, span, numbers).values(), default=0))
         if not count:
-            return Track(tag, (), 0, 0.0)
+            return Track(tag, (), 0, 0.0, 1e-3 * gap_ms)
         way = _Way(count, most_points, gap_ms)
         for row in _stream(f"SELECT ms, x_m, y_m, std_m FROM ({own}) ORDER BY ms", files, span):
             way.add(*row)
@@ -336,7 +412,7 @@ class History:
         columns = "ms / 1000, x_m, y_m, z_m, std_m, hpl_m, alert"
         sql = f"SELECT DISTINCT ON (ms) {columns} FROM ({own} AND list_contains($kept, epoch_ms(t))) ORDER BY ms"
         points = tuple(TrackPoint(*row) for row in _stream(sql, files, span, kept=kept))
-        return Track(tag, points, count, way.length_m)
+        return Track(tag, points, count, way.length_m, 1e-3 * gap_ms)
 
     @_asked
     def heatmap(self, span: Span, cell_m: float = 0.25, tags: Sequence[str] = ()) -> Heatmap:
@@ -370,23 +446,29 @@ class History:
     def contacts(self, tag: str, span: Span, distance_m: float = 2.0) -> tuple[Contact, ...]:
         """Return when other tags were within a horizontal distance of this tag. Raises SkylessError.
 
-        The others' fixes in each second are compared with this tag's first fix in it; in a range with thinned days, in
-        each ten seconds.
+        The others' fixes in each second are compared with this tag's first fix in it; where one of the two sends less
+        often, those in an interval as long as its own.
         """
         check_number("the distance", distance_m, least=0.01, most=LIMITS.contact_m)
         ((tag, own),) = self._tags((tag,)).items()
         names, files = self._names(), self._files(span)
-        length_ms, gap = _CONTACT_MS[_are_thinned(files)]
-        found = [near(*part, own, length_ms, round(1000.0 * distance_m), gap) for part in _parts(files, span)]
+        intervals_s = intervals_in(files, span, None, _CONTACT_SHARE)
+        own_s = max(intervals_s.get(number, 0) for number in own)
+        others = defaultdict[int, list[int]](list)
+        for number in intervals_s.keys() - set(own):
+            others[_BUCKETS_S[bisect_left(_BUCKETS_S, max(own_s, intervals_s[number]))]].append(number)
         contacts = [
             Contact(
                 tag,
                 names.get(number, f"#{number}"),
-                max(1e-3 * length_ms * begin, span.from_unix_s),
-                min(1e-3 * length_ms * (end + 1), span.to_unix_s),
+                max(float(length_s * begin), span.from_unix_s),
+                min(float(length_s * (end + 1)), span.to_unix_s),
                 1e-3 * math.sqrt(square),
             )
-            for number, begin, end, square in joined(found, gap).T.tolist()
+            for length_s, numbers in others.items()
+            for number, begin, end, square in joined(
+                [near(*part, own, length_s, round(1000.0 * distance_m), numbers) for part in _parts(files, span)]
+            ).T.tolist()
         ]
         return tuple(sorted(contacts, key=lambda one: (one.begin_unix_s, one.other)))
 
@@ -481,6 +563,11 @@ class History:
         return found
 
 
+def gone_after_ms(interval_s: int) -> int:
+    """How long a position counts if no other follows."""
+    return round(1000.0 * THRESHOLDS.gone_after_s(interval_s, THRESHOLDS.longest_s))
+
+
 # The way of a tag
 
 
@@ -551,11 +638,6 @@ def _of_days(files: Iterable[Path], span: Span) -> list[Path]:
     """Files that may contain fixes of the range; they are sorted by day of arrival."""
     begin, end = _day(span.from_unix_s, -_EARLY), _day(span.to_unix_s, _LATE)
     return [file for file in files if begin <= day_of(file) <= end]
-
-
-def _are_thinned(files: Iterable[Path]) -> bool:
-    with connection() as duck:
-        return any(THINNED in metadata for metadata in metadata_in(duck, files).values())
 
 
 def _some(known: Iterable[str], kind: str) -> str:
