@@ -66,6 +66,7 @@ class FakeHistory:
             (TrackPoint(1.0, 0.0, 0.0, 0.0, 0.1, None, None), TrackPoint(2.0, 1.0, 0.0, 0.0, 0.1, 0.5, "none")),
             2,
             1.0,
+            10.0,
         )
 
     def heatmap(self, span, cell_m=0.25, tags=()):

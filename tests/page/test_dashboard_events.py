@@ -73,6 +73,17 @@ def test_a_node_that_reports_no_more_is_offline_once_and_comes_back():
     assert texts(log, 1) == ["anchor 3 is online", "anchor 3 does not report any more", "anchor 3 reports again"]
 
 
+def test_a_tag_that_sleeps_or_sends_rarely_is_not_missed_between_its_reports():
+    log = Log()
+    for name, stated in (("asleep", {"sleeps_s": 60.0}), ("rare", {"interval_s": 10.0}), ("ends", {})):
+        log.on_status(status("tag", name), NOW)
+        log.on_health("tag", name, tag_health(name, **stated), NOW)
+        log._table.add_fix(fix(name, NOW), NOW)
+    for second in range(24):
+        log.tick(NOW + second)
+    assert texts(log) == ["tag ends does not report any more"]
+
+
 def test_a_status_that_the_broker_repeats_is_no_start():
     log = Log()
     log.on_status(status("anchor", "3", unix_s=NOW), NOW)

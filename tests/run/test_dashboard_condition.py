@@ -183,6 +183,14 @@ def test_a_fault_is_reported_within_4_s_and_gone_within_7(hall, change, level, k
     assert hall.run(7.0).level == "good"
 
 
+def test_a_tag_is_not_missed_before_its_first_fix_could_have_come():
+    hall = Hall(("rare",)).start()
+    hall.silent, hall.tags = {"rare"}, {"rare": {"interval_s": 60.0}}
+    hall.run(149.0)
+    assert hall.monitor.evaluate(hall.now_s).reasons == ()
+    assert hall.run(3.0).reasons[0].kind == "no-fixes"
+
+
 def test_each_tag_has_the_cause_that_it_gives():
     """Of some tags, then of all."""
     hall = Hall(("t1", "t2", "t3", "t4")).start()

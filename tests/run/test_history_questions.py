@@ -2,9 +2,10 @@
 
 import csv
 import math
+from bisect import bisect_left, bisect_right
 from collections import defaultdict
 from datetime import UTC, datetime
-from itertools import pairwise
+from itertools import groupby, pairwise
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,7 @@ from pyarrow import parquet
 
 from skyless.core.alert import Alert
 from skyless.core.errors import SkylessError
-from skyless.run.history import queries
+from skyless.run.history import queries, scans
 from skyless.run.history.answers import Contact, Dwell, Span
 from skyless.run.history.layout import (
     ASSET_COLUMNS,
@@ -136,16 +137,51 @@ def within(rows):
     return {name: values[order] for name, values in part.items()}
 
 
-def plain_gap_ms(t):
-    """The silence after which a tag with fixes at these times in ms would be gone."""
-    gaps_ms = [one for one in np.diff(t) if one <= 900_000]
-    long_s = [round(one / 1000) for one in gaps_ms if one > 1500]
+def plain_counts_ms(t):
+    """For how long each of a tag's fixes at these times in ms counts; the last one does not."""
+    gaps = [b - a for a, b in pairwise(t)]
+    silences = [k for k, gap in enumerate(gaps) if 2500 < gap <= 900_000]
+    known = sum(gap for gap in gaps if gap <= 900_000)
 
-    def is_usual(gap_s):
-        longer_s = [one for one in long_s if one >= gap_s]
-        return len(longer_s) >= 3 and sum(longer_s) >= 0.15 * sum(gaps_ms) / 1000
+    def is_usual(at):
+        k, own = silences[at], gaps[silences[at]]
+        for other in [*silences[max(at - 4, 0) : at], *silences[at + 1 : at + 5]]:
+            apart = t[other] - t[k] - own if other > k else t[k] - t[other] - gaps[other]
+            if 4 * gaps[other] >= own and apart <= 2 * own:
+                return True
+        return 2 * own > known
 
-    return 1000 * min(max(10, 4 * max(filter(is_usual, {*long_s}), default=0)), 900)
+    usual = {k for at, k in enumerate(silences) if is_usual(at)}
+    return [*(gap if k in usual else min(gap, 10_000) for k, gap in enumerate(gaps)), 0]
+
+
+def plain_contacts(within, own, other, distance_mm):
+    """Begin, end and least distance of contacts, fix by fix."""
+    fixes = {}
+    for tag in (own, other):
+        rows = [within[name][within["tag"] == tag].tolist() for name in ("t", "x_mm", "y_mm")]
+        fixes[tag] = [*zip(*rows, [a + b for a, b in zip(rows[0], plain_counts_ms(rows[0]), strict=True)], strict=True)]
+    mine = []
+    for _, fixes_of_second in groupby(fixes[own], key=lambda fix: fix[0] // 1000):
+        first, *more = fixes_of_second
+        mine.append([*first[:3], max(fix[3] for fix in (first, *more))])
+    for fix, following in pairwise(mine):
+        fix[3] = min(fix[3], following[0])
+    times, found = [fix[0] for fix in mine], []
+    for t, x, y, end in fixes[other]:
+        at = bisect_right(times, t)
+        last = bisect_left(times, end) if end - t > 2500 else at
+        for own_t, own_x, own_y, own_end in mine[max(at - 1, 0) : last]:
+            apart = math.hypot(x - own_x, y - own_y)
+            if max(t, own_t) <= min(end, own_end) and apart <= distance_mm:
+                found.append((max(t, own_t), min(end, own_end), apart))
+    contacts = []
+    for begin, end, apart in sorted(found):
+        if contacts and begin <= contacts[-1][1] + 5000:
+            contacts[-1] = contacts[-1][0], max(contacts[-1][1], end), min(contacts[-1][2], apart)
+        else:
+            contacts.append((begin, end, apart))
+    return [tuple(value / 1000 for value in contact) for contact in contacts]
 
 
 def test_tags_and_zones(history):
@@ -191,10 +227,10 @@ def test_tags_are_found_by_the_names_of_their_assets(history):
 
 
 def plain_length(own):
-    total, at, gap_ms = 0.0, None, plain_gap_ms(own["t"])
+    total, at, counts_ms = 0.0, None, plain_counts_ms(own["t"].tolist())
     for k in range(len(own["t"])):
         here = np.array([own["x_mm"][k], own["y_mm"][k]])
-        if at is None or own["t"][k] - own["t"][k - 1] > gap_ms:
+        if at is None or own["t"][k] - own["t"][k - 1] > counts_ms[k - 1]:
             at = here
         elif np.hypot(*(here - at)) >= max(250, 3 * own["std_mm"][k]):
             total, at = total + np.hypot(*(here - at)), here
@@ -221,9 +257,8 @@ def test_a_heatmap_is_the_time_until_the_next_fix(history, within, tags):
     for tag in [numbers[one] for one in tags] or range(1, TAGS + 1):
         own = within["tag"] == tag
         t, cells = within["t"][own], np.column_stack([within["x_mm"][own], within["y_mm"][own]]) // 300
-        gap_ms = plain_gap_ms(t)
-        for k in range(len(t) - 1):
-            seconds[tuple(cells[k].tolist())] += min(t[k + 1] - t[k], gap_ms) / 1000
+        for cell, counts_ms in zip(cells.tolist(), plain_counts_ms(t.tolist()), strict=True):
+            seconds[tuple(cell)] += counts_ms / 1000
     found = np.array(heatmap.seconds).reshape(heatmap.rows, heatmap.columns)
     x0, y0 = round(heatmap.x0_m / 0.3), round(heatmap.y0_m / 0.3)
     given_ = {(x0 + int(k), y0 + int(j)): found[j, k] for j, k in zip(*np.nonzero(found), strict=True)}
@@ -267,29 +302,17 @@ def test_an_open_visit_ends_where_the_history_does(history, rows):
 
 
 @pytest.mark.parametrize("distance_m", [0.5, 2.0])
-def test_contacts_are_pairs_of_the_same_second(history, within, distance_m):
+def test_contacts_are_times_in_which_the_newest_fixes_are_near(history, within, distance_m):
     found = history.contacts("tag1", SPAN, distance_m)
-    positions = defaultdict(dict)
-    for tag, t, x, y in zip(*(within[name].tolist() for name in ("tag", "t", "x_mm", "y_mm")), strict=True):
-        positions[t // 1000].setdefault(tag, []).append((x, y))
-    near = defaultdict(dict)
-    for second, tags in positions.items():
-        for tag, places in tags.items():
-            least = min((math.dist(a, b) for a in places for b in tags.get(1, ())[:1]), default=math.inf)
-            if tag != 1 and least <= 1000.0 * distance_m:
-                near[tag][second] = least / 1000.0
-    expected = []
-    for tag, seconds in near.items():
-        other = "renamed" if tag == TAGS else f"tag{tag}"
-        first = [second for second in seconds if not {*range(second - 6, second)} & {*seconds}]
-        for begin, following in pairwise([*sorted(first), 10**12]):
-            of_contact = [second for second in seconds if begin <= second < following]
-            least = min(seconds[second] for second in of_contact)
-            expected.append(Contact("tag1", other, begin, min(max(of_contact) + 1, SPAN.to_unix_s), least))
+    expected = [
+        Contact("tag1", "renamed" if tag == TAGS else f"tag{tag}", *contact)
+        for tag in range(2, TAGS + 1)
+        for contact in plain_contacts(within, 1, tag, 1000 * distance_m)
+    ]
     expected.sort(key=lambda one: (one.begin_unix_s, one.other))
     assert len({one.other for one in expected}) > 1
     assert [(one.other, one.begin_unix_s, one.end_unix_s) for one in found] == [
-        (one.other, one.begin_unix_s, one.end_unix_s) for one in expected
+        (one.other, pytest.approx(one.begin_unix_s), pytest.approx(one.end_unix_s)) for one in expected
     ]
     assert [one.least_m for one in found] == pytest.approx([one.least_m for one in expected])
 
@@ -362,15 +385,19 @@ def test_what_cannot_be_answered_is_said(history, ask, error):
     ],
 )
 def test_what_is_too_much_is_refused_with_what_would_do(history, monkeypatch, limits, ask, error):
-    monkeypatch.setattr(queries, "LIMITS", HistoryLimits(**limits))
+    for module in (queries, scans):
+        monkeypatch.setattr(module, "LIMITS", HistoryLimits(**limits))
     with pytest.raises(SkylessError, match=error):
         ask(history)
 
 
-def test_contacts_are_the_same_in_parts(history, monkeypatch):
+def test_contacts_are_the_same_in_parts_but_for_their_edges(history, monkeypatch):
     whole = history.contacts("tag1", SPAN)
-    monkeypatch.setattr(queries, "_PART_S", 100.0)
-    assert history.contacts("tag1", SPAN) == whole != ()
+    monkeypatch.setattr(queries, "_PART_S", 1000.0)
+    in_parts = history.contacts("tag1", SPAN)
+    lengths_s = [sum(one.end_unix_s - one.begin_unix_s for one in found) for found in (whole, in_parts)]
+    assert lengths_s[1] == pytest.approx(lengths_s[0], abs=TAGS * 4 * 10.0)
+    assert {one.other for one in in_parts} == {one.other for one in whole}
 
 
 def test_a_file_that_is_replaced_while_it_is_read(history, monkeypatch):
@@ -384,55 +411,96 @@ def test_a_file_that_is_replaced_while_it_is_read(history, monkeypatch):
         history.heatmap(SPAN)
 
 
-@pytest.fixture(params=[1_000_000, 50], ids=["one file", "many files"])
-def sleepers(request, tmp_path):
-    """An hour of tags that send rarely, next to each other or on a way, and of one that sends often for 10 minutes."""
-    site, draw = site_folder(tmp_path, 2), np.random.default_rng(3)
-    intervals_s = {"minute": 60.0, "ten": 10.0, "bursts": 40.0, "five": 300.0, "often": 0.5}
-    columns = []
-    for number, (name, interval_s) in enumerate(intervals_s.items(), 1):
-        s = np.arange(2.0, 3599.0, interval_s)
-        if name == "bursts":
-            s = np.concatenate([s + 0.1 * k for k in range(20)])
-        if name == "often":
-            s = s[(s >= 1200.0) & (s < 1800.0)]
-        s += draw.uniform(0.0, min(0.05 * interval_s, 1.0), len(s))
-        x_m = s / 20.0 if name == "ten" else np.full(len(s), 1000.0 if name == "five" else number % 2)
-        columns.append(np.array([np.full(len(s), number), 1000 * s, 1000 * x_m, np.zeros(len(s))]).round().astype(int))
-    tag, ms, x_mm, y_mm = np.concatenate(columns, axis=1)[:, np.argsort(np.concatenate(columns, axis=1)[1])]
-    rows = {"tag": tag, "t": round(1000 * MIDNIGHT) + ms, "x_mm": x_mm, "y_mm": y_mm}
+HOUR = Span(MIDNIGHT, MIDNIGHT + 3600.0)
+
+
+def history_of(folder, tags, rows_of_file=1_000_000, thinned=()):
+    """A history of one site with the fixes of tags, times in s after midnight and x in m, in the order of arrival."""
+    site = site_folder(folder, 2)
+    columns = [
+        np.array([np.full(len(s), number), 1000 * np.asarray(s), 1000 * np.broadcast_to(x_m, len(s))])
+        for number, (s, x_m) in enumerate(tags.values(), 1)
+    ]
+    tag, ms, x_mm = np.concatenate(columns, axis=1).round().astype(int)
+    order = np.argsort(ms, kind="stable") if rows_of_file > 0 else np.arange(len(ms))
+    rows = {"tag": tag[order], "t": round(1000 * MIDNIGHT) + ms[order], "x_mm": x_mm[order]}
     rows |= {name: np.full(len(tag), 10) for name in FIX_COLUMNS if name not in rows}
-    for first in range(1, len(tag) + 1, request.param):
-        write_fixes(site, rows, first, min(first + request.param - 1, len(tag)))
-    names = {"tag": [*range(1, 6)], "name": [*intervals_s], "since": [0] * 5}
+    for first in range(1, len(tag) + 1, abs(rows_of_file)):
+        write_fixes(site, rows, first, min(first + abs(rows_of_file) - 1, len(tag)))
+    for file in site.glob("day=*/*.parquet") if thinned else ():
+        marked = parquet.ParquetFile(file).read().replace_schema_metadata({b"skyless_thinned": b"yes"})
+        parquet.write_table(marked, file)
+    names = {"tag": [*range(1, len(tags) + 1)], "name": [*tags], "since": [0] * len(tags)}
     parquet.write_table(arrow_table(NAME_COLUMNS, names), site / "names.parquet")
-    return History(tmp_path, 2)
+    return History(folder, 2)
 
 
-def test_fixes_of_tags_that_send_rarely_count_until_the_next_one(sleepers):
-    span = Span(MIDNIGHT, MIDNIGHT + 3600.0)
-    for tag in ("minute", "ten", "bursts", "five", "often"):
-        track = sleepers.track(tag, span)
-        seconds = sum(sleepers.heatmap(span, tags=(tag,)).seconds)
-        assert seconds == pytest.approx(track.points[-1].unix_s - track.points[0].unix_s)
-        assert seconds > {"five": 3290.0, "often": 598.0}.get(tag, 3530.0)
-        assert track.gap_s == {"five": 900.0, "often": 10.0}.get(tag, track.gap_s)
-        assert track.length_m == pytest.approx(179.0 if tag == "ten" else 0.0, abs=3.0)
+def every(interval_s, first_s=0.0, end_s=3600.0):
+    return np.arange(first_s, end_s, interval_s)
 
 
-def test_contacts_of_tags_that_send_rarely(sleepers):
-    span = Span(MIDNIGHT, MIDNIGHT + 3600.0)
-    for one, other, begin_s, end_s, known_s in (
-        ("minute", "bursts", 0, 3600, 60),
-        ("bursts", "minute", 0, 3600, 60),
-        ("minute", "often", 1200, 1800, 60),
-        ("often", "bursts", 1200, 1800, 60),
-        ("bursts", "ten", 0, 30, 60),
+def seconds_of(history, tag, span=HOUR):
+    return sum(history.heatmap(span, tags=(tag,)).seconds)
+
+
+@pytest.mark.parametrize("rows_of_file", [1_000_000, 50])
+def test_fixes_count_until_the_next_one_also_of_tags_that_send_rarely(tmp_path, rows_of_file):
+    bursts = np.sort(np.concatenate([every(40.0) + 0.1 * k for k in range(20)]))
+    lossy = every(10.0)[np.random.default_rng(3).uniform(size=360) < 0.8]
+    tags = {f"{one:g} s": every(one) for one in (5.0, 10.0, 60.0, 300.0)} | {"bursts": bursts, "lossy": lossy}
+    tags["sleeps, then walks"] = np.concatenate([every(300.0, end_s=1800.0), every(1.0, 1800.0)])
+    history = history_of(tmp_path, {name: (s, 0.05 * s) for name, s in tags.items()}, rows_of_file)
+    for tag, s in tags.items():
+        assert seconds_of(history, tag) == pytest.approx(s[-1] - s[0]), tag
+        assert history.track(tag, HOUR).length_m == pytest.approx(0.05 * (s[-1] - s[0]), abs=0.3), tag
+    assert seconds_of(history, "300 s", Span(MIDNIGHT, MIDNIGHT + 600.0)) == pytest.approx(300.0)
+
+
+def test_an_absence_does_not_count(tmp_path):
+    present = [every(1.0, 0.0, 700.0), every(1.0, 1000.0, 1700.0), every(1.0, 2000.0, 3200.0), every(1.0, 3500.0)]
+    night = np.array([0.0, 1.0, 2.0, 1000.0, 1001.0])
+    history = history_of(tmp_path, {"breaks": (np.concatenate(present), 0.0), "gone": (night, 0.0)})
+    assert seconds_of(history, "breaks") == pytest.approx(3600.0 - 4 - 3 * 300.0 + 3 * 10.0, abs=1.0)
+    assert seconds_of(history, "gone") == pytest.approx(3.0 + 10.0)
+    assert history.track("breaks", HOUR).gap_s == 10.0
+
+
+def test_fixes_that_arrive_late_or_by_turns_in_files_count_once(tmp_path):
+    own, late = np.concatenate([every(1.0, 0.0, 1000.0), every(1.0, 1100.0, 2000.0)]), every(1.0, 1000.0, 1100.0)
+    history = history_of(tmp_path, {"late": (np.concatenate([own, late]), 0.0)}, -len(own))
+    assert seconds_of(history, "late") == pytest.approx(1999.0)
+    turns = every(10.0)
+    history = history_of(tmp_path / "2", {"turns": (np.concatenate([turns[::2], turns[1::2]]), 0.0)}, -180)
+    assert seconds_of(history, "turns") == pytest.approx(3590.0)
+
+
+def test_in_thinned_files_a_fix_counts_for_a_minute(tmp_path):
+    s = np.concatenate([every(10.0, 0.0, 1000.0), [1045.0], every(10.0, 1055.0, 2000.0)])
+    history = history_of(tmp_path, {"mostly moves": (s, 0.0)}, thinned=True)
+    assert seconds_of(history, "mostly moves") == pytest.approx(s[-1])
+
+
+@pytest.mark.parametrize("rows_of_file", [1_000_000, 50])
+def test_contacts_of_tags_that_send_rarely_are_found_from_both(tmp_path, rows_of_file):
+    tags = {
+        "rests, 60": (every(60.0, 2.0), 0.0),
+        "rests, 10": (every(10.0, 5.0), 1.0),
+        "rests, 300": (every(300.0, 7.0), 50.0),
+        "visits": (every(1.0, 1000.0, 1600.0), 0.5),
+        "passes": (every(0.5), every(0.5) - 1755.0),
+    }
+    history = history_of(tmp_path, tags, rows_of_file)
+    for one, other, begin_s, end_s in (
+        ("rests, 60", "rests, 10", 5.0, 3542.0),
+        ("rests, 60", "visits", 1000.0, 1599.0),
+        ("rests, 10", "visits", 1000.0, 1599.0),
+        ("rests, 300", "passes", 1803.0, 1807.5),
     ):
-        (contact,) = [found for found in sleepers.contacts(one, span, 2.0) if found.other == other]
-        assert contact.begin_unix_s - MIDNIGHT == pytest.approx(begin_s, abs=known_s)
-        assert contact.end_unix_s - MIDNIGHT == pytest.approx(end_s, abs=known_s)
-    assert not any("five" in (found.tag, found.other) for found in sleepers.contacts("minute", span, 2.0))
+        for own, seen in ((one, other), (other, one)):
+            (contact,) = [found for found in history.contacts(own, HOUR, 2.0) if found.other == seen]
+            times_s = contact.begin_unix_s - MIDNIGHT, contact.end_unix_s - MIDNIGHT
+            assert times_s == pytest.approx((begin_s, end_s), abs=1.01), (own, seen)
+    assert {found.other for found in history.contacts("rests, 300", HOUR, 2.0)} == {"passes"}
 
 
 def test_sql_sees_every_fix_of_the_range(history, within, tmp_path):

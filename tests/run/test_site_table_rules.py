@@ -53,9 +53,11 @@ def test_the_interval_of_a_tag_is_known_after_ten_seconds():
 @pytest.mark.parametrize(
     ("fixes_s", "interval_s"),
     [
-        ([*each_second(0, 85), 100.0], 15.0),  # a gap that fills 15 % of the time in which it is remembered
-        ([*each_second(0, 86), 100.0], 0.0),
-        ([1000.0, 1020.0, 1120.0], 100.0),  # of a tag that was not heard for longer
+        ([*each_second(0, 51), 60.0], 9.0),  # a gap that fills 15 % of the time in which it is remembered
+        ([*each_second(0, 52), 61.0], 0.0),
+        ([*each_second(0, 85), 100.0], 0.0),  # it had gone
+        ([1000.0, 1020.0, 1090.0], 70.0),  # of a tag that was not heard for longer
+        ([1000.0, 1020.0, 1120.0], 20.0),  # it had gone after 80 s
         ([*each_second(0, 100), 108.0, 118.0], 10.0),  # 8 s are as long as 10 s
         ([*each_second(0, 100), 107.9, 117.9], 7.9),
         ([*each_second(0, 90), *each_second(100, 190), 200.0], 10.0),  # the first gap is remembered for 100 s
@@ -234,15 +236,38 @@ def test_a_status_or_health_beyond_the_limit_of_names_is_nobody_s(monkeypatch):
     assert table.roster.admits("tag", "t2") is False
 
 
-def test_an_anchor_is_used_while_the_newest_fix_that_used_it_is_fresh():
+def test_an_anchor_is_used_while_a_fix_that_used_it_is_fresh():
     table = SiteTable(0.0)
     table.add_health("anchor", "2", anchor_health(2), 0.0)
+    table.add_fix(fix("often", anchors=(1, 2)), 1.0)
+    assert [(name, node.used_until_s) for name, node in table.senders("anchor")] == [("1", 3.5), ("2", 3.5)]
     table.add_health("tag", "rare", tag_health("rare", interval_s=10.0), 2.0)
-    for tag, now_s, fresh_s in (("often", 1.0, THRESHOLDS.fresh_s), ("rare", 2.0, 10.0 * THRESHOLDS.fresh_intervals)):
-        table.add_fix(fix(tag, anchors=(1, 2)), now_s)
-        for _, anchor in table.senders("anchor"):
-            assert [table.is_used(anchor, now_s + fresh_s + late_s) for late_s in (-0.01, 0.01)] == [True, False]
-    assert [name for name, _ in table.senders("anchor")] == ["1", "2"]
+    table.add_fix(fix("rare", anchors=(2,)), 2.0)
+    table.add_fix(fix("often", anchors=(2,), serial=2), 3.0)
+    assert table.get("anchor", "2").used_until_s == 2.0 + 10.0 * THRESHOLDS.fresh_intervals
+
+
+@pytest.mark.parametrize("health_first", [True, False])
+def test_a_tag_that_wakes_early_and_stops_is_gone_after_its_own_time(health_first):
+    """Its announced sleep counts neither as silence nor as its interval once it is awake."""
+    table = SiteTable(0.0)
+    for now_s in range(20):
+        table.add_fix(fix(unix_s=float(now_s), serial=now_s), float(now_s))
+    table.add_health("tag", "t1", tag_health(sleeps_s=28_800.0), 20.0)
+    assert table.add_status(status("tag", "t1", online=False), 20.5) is False, "it disconnects to sleep"
+    assert [table.tick(float(now_s)) for now_s in range(21, 600)] == [[]] * 579
+    assert table.presence(table.get("tag", "t1"), 599.0) == "asleep"
+    table.add_status(status("tag", "t1", online=True), 600.0)
+    for say in (True, False) if health_first else (False, True):
+        if say:
+            table.add_health("tag", "t1", tag_health(), 600.0)
+        else:
+            table.add_fix(fix(unix_s=600.0, serial=600), 600.0)
+    for now_s in range(601, 700):
+        table.add_fix(fix(unix_s=float(now_s), serial=now_s), float(now_s))
+        assert table.tick(float(now_s)) == []
+    gone = {now_s: table.tick(float(now_s)) for now_s in range(700, 730)}
+    assert [now_s for now_s, tags in gone.items() if tags] == [709]
 
 
 def test_nodes_are_in_natural_order():

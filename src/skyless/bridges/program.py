@@ -134,7 +134,8 @@ class BridgeNode:
         table, silent_s = self.hub.table, now_s - self._last_fix_s
         if self._is_silent or silent_s < THRESHOLDS.grace_s:
             return
-        if not any(table.presence(tag, now_s) in ("fresh", "asleep") for tag in table.fixed.values()):
+        presences = {table.presence(tag, now_s) for tag in table.fixed.values()}
+        if "late" in presences or presences <= {"gone"}:
             self._is_silent = True
             known = "no tag publishes fixes" if self._site is not None else "the site itself is not on the broker"
             self._log(f"no fix for {silent_s:.0f} s: {known}; skyless dashboard shows why")

@@ -149,7 +149,8 @@ class EventLog:
                 if node.health is None or node.online is False or (kind, name) in self._silent:
                     continue
                 reported_s = max(node.health_s, node.since_s or node.health_s, self._paused_s)
-                if now_s - reported_s > THRESHOLDS.report_s:
+                is_expected = kind != "tag" or self._table.presence(node, now_s) in ("late", "gone")
+                if now_s - reported_s > THRESHOLDS.report_s and is_expected:
                     self._silent.add((kind, name))
                     self._add_presence((kind, name), False, now_s, "does not report any more")
         for name, alert in self._alerts.items():

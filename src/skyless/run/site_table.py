@@ -47,10 +47,6 @@ class Thresholds(Struct, frozen=True):
     """The watch of the anchors reports every 10 s at least."""
     forgotten_s: float = 86_400.0
 
-    def gone_after_s(self, interval_s: float, longest_s: float) -> float:
-        """How long a tag with this interval must be silent to be gone."""
-        return min(max(self.gone_s, self.gone_intervals * interval_s), longest_s)
-
 
 THRESHOLDS: Final = Thresholds()
 
@@ -68,14 +64,14 @@ _SET_BACK_S: Final = 10.0
 """A fix older than the newest by more than this is of a clock that was set back; others that are older are late."""
 
 # A tag's own interval, from its gaps. Only gaps that can change an answer are kept; shorter ones change nothing.
-SHORT_GAP_S: Final = 1.5
+_SHORT_S: Final = 1.5
 _MAX_GAPS: Final = 8
 _KNOWN_S: Final = 10.0
 """The interval of a tag heard for a shorter time is unknown: it may send in bursts, with long silence between them."""
 _LEARN_S: Final = 1.0  # shortest time between two looks at the gaps of a tag that sends often
 _MEMORY: Final = 10.0
 """A gap is remembered for this many times its length."""
-RHYTHM_SHARE: Final = 0.15
+_SHARE: Final = 0.15
 """Gaps that fill this share of the remembered time are the tag's rhythm. A single gap of a tag that has been heard for
 long fills 10 %, and is an outage."""
 _ALIKE: Final = 0.8
@@ -96,8 +92,9 @@ class Node:
 
     __slots__ = (
         *("asleep_until_s", "codes_s", "ended_unix_s", "first_s", "fix", "fix_s", "gaps"),
-        *("health", "health_s", "health_serial", "heard_s", "is_due", "is_gone", "learn_s", "learnt_s"),
-        *("name", "previous", "row", "sends", "serial", "since_s", "stated_s", "status", "status_serial", "used"),
+        *("due_s", "health", "health_s", "health_serial", "heard_s", "is_gone", "learn_s", "learnt_s"),
+        *("name", "previous", "row", "sends", "serial", "since_s", "stated_s", "status", "status_serial"),
+        "used_until_s",
     )
 
     def __init__(self, name: str) -> None:
@@ -113,14 +110,14 @@ class Node:
         self.sends = False  # whether messages of its own arrive; otherwise it is known only from batches, or expected
         self.first_s = float("-inf")  # arrival of the first fix since it was last gone
         self.is_gone = True  # as of the last ``tick``, fix or status
-        self.is_due = False  # whether ``tick`` looks at it some time
+        self.due_s = float("inf")  # when ``tick`` looks at it next
         self.heard_s: float | None = None  # arrival of the first fix of all
         self.gaps: list[_Gap] = []  # the last long gaps between fixes
         self.learnt_s = 0.0  # the interval that the gaps show
         self.learn_s = float("-inf")  # time when they are looked at again, besides after each gap
         self.stated_s = 0.0  # the interval that the tag states
         self.asleep_until_s = float("-inf")
-        self.used: tuple[float, Node] | None = None  # arrival of the last fix that used this anchor, and its tag
+        self.used_until_s = float("-inf")  # until when a fix that used this anchor is fresh
         self.codes_s: float | None = None  # time since when it states that its beacons have codes
         self.serial = self.health_serial = self.status_serial = 0
         """Count of the table at the last change, for readers that want what is new."""
@@ -155,16 +152,25 @@ class Node:
         is_known = self.gaps or self.stated_s or (self.heard_s is not None and self.fix_s - self.heard_s >= _KNOWN_S)
         return max(self.learnt_s, self.stated_s) if is_known else None
 
+    def gone_after_s(self, longest_s: float) -> float:
+        """How long it must be silent to be gone, at most ``longest_s``."""
+        interval_s = self.interval_s
+        if interval_s is None:
+            return longest_s
+        return min(max(THRESHOLDS.gone_s, THRESHOLDS.gone_intervals * interval_s), longest_s)
+
     def note_fix(self, now_s: float, ready_s: float, longest_s: float) -> None:
         """Note the arrival of a fix, and learn from the gap before it, as far as messages could arrive in it.
 
         A gap of more than ``longest_s`` is no rhythm: the tag was away.
         """
-        gap_s, self.fix_s = now_s - max(self.fix_s, ready_s, self.asleep_until_s), now_s
+        gap_s = now_s - max(self.fix_s, ready_s, self.asleep_until_s)
         if self.heard_s is None:
             self.heard_s = now_s
-        elif SHORT_GAP_S < gap_s <= longest_s:
-            self.gaps, self.learn_s = [*self.gaps[1 - _MAX_GAPS :], _Gap(now_s, gap_s, self.is_gone)], now_s
+        elif _SHORT_S < gap_s <= longest_s:
+            was_gone = self.is_gone or gap_s >= self.gone_after_s(longest_s)
+            self.gaps, self.learn_s = [*self.gaps[1 - _MAX_GAPS :], _Gap(now_s, gap_s, was_gone)], now_s
+        self.fix_s = now_s
         if self.is_gone:
             self.is_gone, self.first_s = False, now_s
         if self.gaps and now_s >= self.learn_s:
@@ -179,7 +185,7 @@ class Node:
         span_s = min(_MEMORY * gap_s, now_s - self.heard_s)
         alike = [gap for gap in self.gaps if gap.length_s >= _ALIKE * gap_s and now_s - gap.end_s <= span_s]
         is_absence = len(alike) == 1 and alike[0].was_gone
-        return not is_absence and sum(gap.length_s for gap in alike) >= RHYTHM_SHARE * span_s
+        return not is_absence and sum(gap.length_s for gap in alike) >= _SHARE * span_s
 
 
 class SiteTable:
@@ -295,8 +301,10 @@ class SiteTable:
         node.status, node.status_serial = status, self.statuses_serial
         if status.online:
             return False
-        was_there, node.is_gone = not node.is_gone, True
         node.previous, node.codes_s = None, None
+        if node.asleep_until_s > now_s:
+            return False  # a tag that disconnects as it falls asleep
+        was_there, node.is_gone = not node.is_gone, True
         if node.fix is not None:
             self._changed(node)
         return was_there
@@ -316,11 +324,13 @@ class SiteTable:
             elif node.codes_s is None:
                 node.codes_s = now_s
         elif isinstance(health, TagHealth):
+            fresh_s, sleep_s = self.fresh_for_s(node), _duration_s(health.sleeps_s)
             node.stated_s = _duration_s(health.interval_s)
-            sleep_s = _duration_s(health.sleeps_s)
-            if sleep_s or node.asleep_until_s > now_s:
+            if sleep_s or node.asleep_until_s > now_s or self.fresh_for_s(node) != fresh_s:
                 self._changed(node)
-            node.asleep_until_s = now_s + sleep_s if sleep_s else float("-inf")
+            node.asleep_until_s = now_s + sleep_s if sleep_s else min(node.asleep_until_s, now_s)
+            if not node.is_gone:
+                self._look_at(node, max(now_s, node.asleep_until_s) + THRESHOLDS.gone_s)
 
     def add_fix(self, fix: FixMessage, now_s: float, *, batched: bool = False) -> Node | None:
         """Add a tag's fix; None for one that is late or repeated, or of a tag that is not admitted.
@@ -339,13 +349,13 @@ class SiteTable:
         node.fix = fix
         self.fixed[fix.tag] = node
         self._changed(node)
-        anchors, now_used = self._nodes["anchor"], (now_s, node)
+        anchors, until_s = self._nodes["anchor"], now_s + self.fresh_for_s(node)
         for anchor in map(str, fix.anchors):
             used = anchors.get(anchor)
             if used is None or not used.sends:
                 used = self.add("anchor", anchor, sends=True)
             if used is not None:
-                used.used = now_used
+                used.used_until_s = max(used.used_until_s, until_s)
         return node
 
     def hear(self, tags: Iterable[str], now_s: float) -> dict[str, float]:
@@ -356,7 +366,7 @@ class SiteTable:
         known, rare = self._nodes["tag"], {}
         for name in tags:
             node = known.get(name)
-            if node is None or node.is_gone or node.gaps or now_s - node.fix_s > SHORT_GAP_S:
+            if node is None or node.is_gone or node.gaps or now_s - node.fix_s > _SHORT_S:
                 node = self.add("tag", name)
                 if node is not None:
                     self._note(node, now_s)
@@ -371,10 +381,14 @@ class SiteTable:
         self.fixes_serial += 1
         tag.serial, tag.row = self.fixes_serial, None
 
+    def _look_at(self, tag: Node, at_s: float) -> None:
+        """Let ``tick`` look at a tag then, unless it does so before."""
+        if at_s < tag.due_s:
+            tag.due_s = at_s
+            heappush(self._due, (at_s, tag.name))
+
     def _note(self, node: Node, now_s: float) -> None:
-        if not node.is_due:
-            node.is_due = True
-            heappush(self._due, (now_s + THRESHOLDS.gone_s, node.name))
+        self._look_at(node, now_s + THRESHOLDS.gone_s)
         node.begin(now_s)
         node.note_fix(now_s, self.ready_s, self.longest_silence_s(node))
 
@@ -408,9 +422,11 @@ class SiteTable:
         return self._sorted[kind]
 
     def in_grace(self, now_s: float, node: Node | None = None) -> bool:
-        """Whether the connection, or a node, is too young to be complete."""
-        since_s = self.ready_s if node is None or node.since_s is None else max(node.since_s, self.ready_s)
-        return now_s - since_s < THRESHOLDS.grace_s
+        """Whether the connection, or a node, is too young to be complete, such as for a tag's first fix."""
+        if node is None:
+            return now_s - self.ready_s < THRESHOLDS.grace_s
+        since_s = max(self.ready_s, node.since_s or self.ready_s)
+        return now_s - since_s < max(THRESHOLDS.grace_s, self.fresh_for_s(node))
 
     def silent_s(self, tag: Node, now_s: float) -> float:
         """For how long a tag has had no fix, without the time in which none could arrive and in which it slept."""
@@ -431,16 +447,11 @@ class SiteTable:
 
     def gone_after_s(self, tag: Node) -> float:
         """For how long a tag must be silent to be gone."""
-        interval_s, longest_s = tag.interval_s, self.longest_silence_s(tag)
-        return longest_s if interval_s is None else THRESHOLDS.gone_after_s(interval_s, longest_s)
+        return tag.gone_after_s(self.longest_silence_s(tag))
 
     def is_fresh(self, tag: Node, now_s: float) -> bool:
         """Whether a tag's newest fix is fresh, and its program has not ended since."""
         return not tag.is_gone and now_s - tag.fix_s < self.fresh_for_s(tag)
-
-    def is_used(self, anchor: Node, now_s: float) -> bool:
-        """Whether the newest fix that used an anchor is fresh."""
-        return anchor.used is not None and now_s - anchor.used[0] < self.fresh_for_s(anchor.used[1])
 
     def is_there(self, tag: Node, now_s: float) -> bool:
         """Whether a tag has had a fix and is not gone."""
@@ -458,20 +469,20 @@ class SiteTable:
         """Return the tags that have gone since the last call, and forget what has been gone for long."""
         gone = []
         while self._due and self._due[0][0] <= now_s:
-            _, name = heappop(self._due)
+            due_s, name = heappop(self._due)
             tag = self.get("tag", name)
-            if tag is None:
+            if tag is None or tag.due_s != due_s:
                 continue
-            tag.is_due = not tag.is_gone
+            tag.due_s = float("inf")
             if tag.is_gone:
                 continue
             left_s = self.gone_after_s(tag) - self.silent_s(tag, now_s)
             if left_s <= 0.0:
-                tag.is_gone, tag.is_due = True, False
+                tag.is_gone = True
                 gone.append(name)
             else:
                 wait_s = min(max(left_s, _LOOK_S), THRESHOLDS.gone_s)  # its interval may become known meanwhile
-                heappush(self._due, (max(now_s, tag.asleep_until_s) + wait_s, name))
+                self._look_at(tag, max(now_s, tag.asleep_until_s) + wait_s)
         if now_s - self._forget_s >= _FORGET_PERIOD_S:
             self._forget_s = now_s
             self._forget(now_s)

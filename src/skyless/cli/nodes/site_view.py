@@ -218,9 +218,7 @@ class SiteView:
             trouble=self.link.trouble,
             condition=self.condition,
             tags=self._tag_rows(tags, now_s),
-            anchors=tuple(
-                sorted((self._anchor_row(*one, now_s) for one in named), key=lambda row: row.state not in GONE)
-            ),
+            anchors=tuple(sorted((_anchor_row(*one, now_s) for one in named), key=lambda row: row.state not in GONE)),
             alarms=tuple(sorted(self._alarms.values(), key=_alarm_rank)),
             drops={reason: count for reason, count in drops.most_common() if count and reason not in NOT_DROPS},
             unused=dict(self.feed.drops),
@@ -232,25 +230,28 @@ class SiteView:
         for name, tag in tags:
             health = tag.health if tag.reports(now_s) and isinstance(tag.health, TagHealth) else None
             state: TagState = "no fix"
-            if tag.online is False:
+            found = self.table.presence(tag, now_s) if self.table.connected else "late"
+            if found == "asleep":
+                state = "asleep"
+            elif tag.online is False:
                 state = "offline"
-            elif tag.fix is not None and self.table.connected:
-                found = self.table.presence(tag, now_s)
-                state = "fix" if found == "fresh" else "asleep" if found == "asleep" else "no fix"
+            elif found == "fresh":
+                state = "fix"
             age_s = None if tag.fix is None else self._wall_clock() - tag.ended_unix_s
             rows.append(TagRow(name, state, age_s, tag.fix, health, assets[name].name if name in assets else ""))
         return tuple(sorted(rows, key=_tag_rank))
 
-    def _anchor_row(self, name: str, node: Node, now_s: float) -> AnchorRow:
-        health = node.health if isinstance(node.health, AnchorHealth) else None
-        state = "silent"
-        if node.online is False:
-            state = "offline"
-        elif health is None and self.table.is_used(node, now_s):
-            state = "used"
-        elif health is not None and node.reports(now_s):
-            state = health.role
-        return AnchorRow(name, state, None if health is None else now_s - node.health_s, health)
+
+def _anchor_row(name: str, node: Node, now_s: float) -> AnchorRow:
+    health = node.health if isinstance(node.health, AnchorHealth) else None
+    state = "silent"
+    if node.online is False:
+        state = "offline"
+    elif health is None and now_s < node.used_until_s:
+        state = "used"
+    elif health is not None and node.reports(now_s):
+        state = health.role
+    return AnchorRow(name, state, None if health is None else now_s - node.health_s, health)
 
 
 def _tag_rank(row: TagRow) -> int:

@@ -6,9 +6,8 @@ DuckDB reads the files. Rows that are in no file yet, from the last ten minutes 
 import contextlib
 import math
 from array import array
-from bisect import bisect_left
 from collections import defaultdict
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from datetime import UTC, datetime, timedelta
 from functools import wraps
 from itertools import chain
@@ -18,7 +17,6 @@ from typing import Any, Final, ParamSpec, TypeVar
 import duckdb
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from skyless.arguments import check_number
 from skyless.core.errors import SkylessError
@@ -37,210 +35,16 @@ from skyless.run.history.layout import (
     site_folder,
     sites_in,
 )
+from skyless.run.history.scans import GONE_MS, KNOWN, fixes_in, joined, near, time_in_cells
 from skyless.run.history.tables import (
-    ROW_GROUP,
     check_readable,
     connection,
     database,
     pattern,
     quoted,
     read_rows,
-    select,
 )
-from skyless.run.site_table import RHYTHM_SHARE, SHORT_GAP_S, THRESHOLDS
 from skyless.run.web import HISTORY as LIMITS
-
-# Times in cells and contacts need all rows: NumPy takes a third of DuckDB's processor time here.
-
-_SIDE: Final = 2000
-"""Cells along each side of the grid, which is centred on the first fixes. Not a power of two: rows would then share few
-cache lines."""
-_OUTSIDE: Final = _SIDE * _SIDE
-_WILD_SHARE: Final = 1e-3
-"""Largest share of the time that wild fixes outside the grid may account for."""
-
-_GAP_BITS: Final = 10  # of a gap in whole seconds, beside its tag
-_LEAST_GAPS: Final = 3
-
-_ScanInts = NDArray[Any]
-
-
-def time_in_cells(files: Sequence[Path], span: Span, cell_mm: int, tags: Collection[int] | None) -> Heatmap:
-    """Return how long tags were in each cell of a grid; ``tags`` None means all. Raises SkylessError, duckdb.Error.
-
-    A fix counts until the tag's next one in the range, or until the tag would be gone (``run/site_table.py``). The
-    tag's last fix does not count.
-    """
-    sums_ms = np.zeros(_OUTSIDE + 1, np.int64)
-    corner: list[int] = []
-
-    def cells() -> Iterator[list[_ScanInts]]:
-        for tag, t, x, y in fixes_in(files, span, tags, "x_mm", "y_mm"):
-            places = x // cell_mm, y // cell_mm
-            corner[:] = corner or [int(np.median(one)) - _SIDE // 2 for one in places]
-            column, row = ((one - first).view(np.uint32) for one, first in zip(places, corner, strict=True))
-            cell = (row * np.uint32(_SIDE) + column).astype(np.intp)
-            if column.max() >= _SIDE or row.max() >= _SIDE:  # negative ones are large as unsigned numbers
-                cell[(column >= _SIDE) | (row >= _SIDE)] = _OUTSIDE
-            yield [tag, t, cell]
-
-    intervals_s = intervals_in(files, span, tags)
-    counts_ms = _by_tag({tag: gone_after_ms(interval_s) for tag, interval_s in intervals_s.items()})
-    for (tag, _, cell), gap_ms in with_gaps(cells()):
-        np.add.at(sums_ms, cell, np.minimum(gap_ms, counts_ms(tag)))  # fast for these types only
-    if sums_ms[_OUTSIDE] > _WILD_SHARE * sums_ms.sum():
-        raise SkylessError(f"cells of {1e-3 * cell_mm:g} m are too many; choose larger ones")
-    grid, number, cell_m = sums_ms[:_OUTSIDE].reshape(_SIDE, _SIDE), len(intervals_s), 1e-3 * cell_mm
-    columns, rows = np.flatnonzero(grid.any(axis=0)), np.flatnonzero(grid.any(axis=1))
-    if not len(rows):
-        return Heatmap(0.0, 0.0, cell_m, 0, 0, (), number)
-    grid = grid[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
-    if grid.size > LIMITS.cells:
-        right = f"choose ones of {1.1 * cell_m * math.sqrt(grid.size / LIMITS.cells):.2g} m"
-        raise SkylessError(f"{grid.size} cells of {cell_m:g} m are too many; {right}")
-    x0_m, y0_m = (cell_m * (first + int(used[0])) for first, used in zip(corner, (columns, rows), strict=True))
-    return Heatmap(x0_m, y0_m, cell_m, grid.shape[1], grid.shape[0], tuple((1e-3 * grid.ravel()).tolist()), number)
-
-
-def with_gaps(batches: Iterable[list[_ScanInts]]) -> Iterator[tuple[list[_ScanInts], _ScanInts]]:
-    """Yield fixes, of which the first columns are tags and times in ms, with the time until the same tag's next one.
-
-    The last fix of a tag in a batch has 0 there, and comes again at the end if the next one is in another batch.
-    """
-    edges: list[list[_ScanInts]] = []
-    for batch in batches:
-        tag, t = batch[:2]
-        is_last = np.append(tag[1:] != tag[:-1], True)
-        gap_ms = np.append(t[1:] - t[:-1], 0)
-        gap_ms[is_last] = 0
-        yield batch, gap_ms
-        for is_edge, is_end in ((np.append(True, is_last[:-1]), False), (is_last, True)):
-            edges.append([*(column[is_edge] for column in batch), np.full(np.count_nonzero(is_edge), is_end)])
-    if edges:
-        columns = [np.concatenate(parts) for parts in zip(*edges, strict=True)]
-        order = np.lexsort((columns[-1], columns[1], columns[0]))
-        tag, t, *others, ends = (column[order] for column in columns)
-        pairs = np.flatnonzero(ends[:-1] & ~ends[1:] & (tag[1:] == tag[:-1]))
-        if len(pairs):
-            yield [column[pairs] for column in (tag, t, *others)], np.diff(t)[pairs]
-
-
-def intervals_in(
-    files: Sequence[Path], span: Span, tags: Collection[int] | None, share: float = RHYTHM_SHARE
-) -> dict[int, int]:
-    """Return each tag's own interval in seconds, 0 if it is short. Raises duckdb.Error.
-
-    Nearly as ``run/site_table.py`` learns it: the longest gap such that it and longer ones, three at least, fill a
-    share of the tag's time in the range. Gaps in which any tag would be gone are absences.
-    """
-    heard: list[tuple[_ScanInts, _ScanInts]] = []  # tags, and times in ms without absences
-    gaps: list[tuple[_ScanInts, _ScanInts]] = []  # tags with lengths in s, and numbers of such gaps
-    for (tag, *_), gap_ms in with_gaps(fixes_in(files, span, tags)):
-        gap_ms[gap_ms > 1000.0 * THRESHOLDS.longest_s] = 0
-        first = np.flatnonzero(np.append(True, tag[1:] != tag[:-1]))
-        heard.append((tag[first], np.add.reduceat(gap_ms, first)))
-        is_long = gap_ms > 1000.0 * SHORT_GAP_S
-        lengths_s = np.rint(1e-3 * gap_ms[is_long]).astype(np.int64)
-        gaps.append(np.unique((tag[is_long].astype(np.int64) << _GAP_BITS) + lengths_s, return_counts=True))
-    known_ms = dict(zip(*(column.tolist() for column in _sums(heard)), strict=True))
-    found = dict.fromkeys(known_ms, 0)
-    keys, counts = _sums(gaps)
-    if not len(keys):
-        return found
-    changes = np.flatnonzero(np.diff(keys >> _GAP_BITS)) + 1
-    for key, count in zip(np.split(keys, changes), np.split(counts, changes), strict=True):
-        number, length_s = int(key[0]) >> _GAP_BITS, key & ((1 << _GAP_BITS) - 1)
-        longer, longer_s = (np.cumsum(one[::-1])[::-1] for one in (count, count * length_s))
-        is_usual = (longer >= _LEAST_GAPS) & (1000 * longer_s >= share * known_ms[number])
-        found[number] = int(length_s[is_usual].max(initial=0))
-    return found
-
-
-def _sums(parts: Sequence[tuple[_ScanInts, _ScanInts]]) -> tuple[_ScanInts, _ScanInts]:
-    """Sorted keys of all parts, each once, with the sum of its values."""
-    nothing = np.empty(0, np.int64)
-    keys, values = (np.concatenate(columns) for columns in zip((nothing, nothing), *parts, strict=True))
-    found, at = np.unique(keys, return_inverse=True)
-    return found, np.bincount(at, values, len(found)).astype(np.int64)
-
-
-def _by_tag(values: Mapping[int, int]) -> Callable[[_ScanInts], _ScanInts]:
-    """Return a function that looks up the values of tags."""
-    tags, found = (np.array(column) for column in zip((-1, 0), *sorted(values.items()), strict=True))
-    if len({*values.values()}) < 2:  # usually; looking up costs as much as the sums
-        return lambda _: found[-1]
-    return lambda tag: found[np.searchsorted(tags, tag)]
-
-
-def near(
-    files: Sequence[Path], span: Span, own: Collection[int], bucket_s: int, distance_mm: int, others: Collection[int]
-) -> NDArray[np.int64]:
-    """Find when tags with the numbers ``others`` were near the tag with the numbers ``own``.
-
-    Returns a row each for tags, first and last buckets of time, and least squared distances. Of ``own``, the first fix
-    in a bucket is compared. Raises duckdb.Error.
-    """
-    firsts: list[tuple[_ScanInts, ...]] = []
-    bucket_ms = 1000 * bucket_s
-    for _, t, x, y in fixes_in(files, span, own, "x_mm", "y_mm"):
-        nth = np.unique(t // bucket_ms, return_index=True)[1]
-        firsts.append((t[nth], x[nth], y[nth]))
-    if not firsts:
-        return np.empty((4, 0), np.int64)
-    times, *places = (np.concatenate(columns) for columns in zip(*firsts, strict=True))
-    del firsts
-    order = np.argsort(times)
-    buckets, nth = np.unique(times[order] // bucket_ms, return_index=True)
-    x0, y0 = (column[order[nth]].astype(np.int64) for column in places)
-    runs: list[NDArray[np.int64]] = []
-    for tag, t, x, y in fixes_in(files, span, None, "x_mm", "y_mm"):
-        bucket = t // bucket_ms
-        at = np.searchsorted(buckets, bucket).clip(max=len(buckets) - 1)
-        rows = np.flatnonzero((np.abs(x - x0[at]) <= distance_mm) & (buckets[at] == bucket))
-        rows = rows[(np.abs(y[rows] - y0[at[rows]]) <= distance_mm) & np.isin(tag[rows], list(others))]
-        square = (x[rows] - x0[at[rows]]) ** 2 + (y[rows] - y0[at[rows]]) ** 2
-        found = np.array([tag[rows], bucket[rows], bucket[rows], square], np.int64)
-        runs.append(joined([found[:, square <= distance_mm**2]]))
-        if sum(one.shape[1] for one in runs) > 2 * LIMITS.contacts:
-            runs = [joined(runs)]
-    return joined(runs)
-
-
-def joined(parts: Sequence[NDArray[np.int64]]) -> NDArray[np.int64]:
-    """Join runs of buckets of the same tag with at most ``_PAUSE`` buckets between them.
-
-    Raises SkylessError if there are too many.
-    """
-    runs = np.concatenate([np.empty((4, 0), np.int64), *parts], axis=1)
-    if not runs.size:
-        return runs
-    tag, first, last, square = runs[:, np.lexsort((runs[1], runs[0]))]
-    is_other = np.append(True, tag[1:] != tag[:-1])
-    later = np.cumsum(is_other) * (last.max() - first.min() + _PAUSE + 2)  # each tag after the one before
-    until = np.maximum.accumulate(last + later)
-    begins = np.flatnonzero(np.append(True, (first + later)[1:] > until[:-1] + _PAUSE + 1))
-    if len(begins) > LIMITS.contacts:
-        raise SkylessError("the contacts are too many; choose a shorter range or a smaller distance")
-    return np.array(
-        [tag[begins], first[begins], np.maximum.reduceat(last, begins), np.minimum.reduceat(square, begins)]
-    )
-
-
-def fixes_in(
-    files: Sequence[Path], span: Span, tags: Collection[int] | None, *places: str
-) -> Iterator[list[_ScanInts]]:
-    """Yield fixes by tag and time, in batches: columns of tags, of times in ms and of ``places``."""
-    begin_ms, end_ms = (math.ceil(round(1000.0 * unix_s, 2)) for unix_s in (span.from_unix_s, span.to_unix_s))
-    kinds = {name: FIX_COLUMNS[name] for name in ("tag", "t", *places)}
-    wanted = f"t >= make_timestamptz({1000 * begin_ms}) AND t < make_timestamptz({1000 * end_ms})"
-    wanted += "".join(f" AND {name} NOT NULL" for name in ("tag", *places))
-    wanted += "" if tags is None else f" AND tag IN ({', '.join(map(str, tags))})"
-    with connection() as duck:
-        for file in files:
-            columns = [*select(duck, [file], kinds, wanted).fetchnumpy().values()]
-            for first in range(0, len(columns[0]), ROW_GROUP):  # in parts, which needs less memory
-                yield [column[first : first + ROW_GROUP] for column in columns]
-
 
 _EARLY: Final = timedelta(hours=1)
 _LATE: Final = timedelta(days=1)
@@ -256,12 +60,6 @@ _TRIES: Final = 3
 _MOVE_M: Final = 0.25
 _MOVE_SIGMAS: Final = 3.0
 """Shorter moves, in standard deviations of the fix, may be noise and do not lengthen a track."""
-_BUCKETS_S: Final = (1, 2, 5, 10, 30, 60, 120, 300, 900)
-"""Lengths of the intervals in which fixes are compared: the shortest that is no shorter than the tags' own ones."""
-_CONTACT_SHARE: Final = 0.5
-"""A tag sends rarely, for contacts, if it does so for this share of its time: longer intervals are less exact."""
-_PAUSE: Final = 5
-"""The longest interruption of a contact, in such intervals."""
 _PART_S: Final = 28.0 * 86_400.0
 _NAMED: Final = 5
 """How many known names an error lists."""
@@ -273,12 +71,10 @@ _FIX_VALUES: Final = f"""
     flags & {SIMULATED} != 0 AS simulated
 """
 
-_KNOWN: Final = "tag NOT NULL AND x_mm NOT NULL AND y_mm NOT NULL"
-
 _FIXES: Final = f"""
     SELECT tag, epoch_ms(t) AS ms, {_FIX_VALUES}
     FROM read_parquet($files) WHERE t >= to_timestamp($begin) AND t < to_timestamp($end)
-        AND z_mm NOT NULL AND std_mm NOT NULL AND {_KNOWN}
+        AND z_mm NOT NULL AND std_mm NOT NULL AND {KNOWN}
 """
 
 _DWELL: Final = """
@@ -399,20 +195,24 @@ class History:
         ((tag, numbers),) = self._tags((tag,)).items()
         check_number("the number of points", most_points, least=2, most=LIMITS.points)
         files, own = self._files(span), f"{_FIXES} AND tag IN ({', '.join(map(str, numbers))})"
-        if not files:
-            return Track(tag, (), 0, 0.0, 0.0)
-        ((count,),) = _stream(f"SELECT count(*) FROM ({own})", files, span)
-        gap_ms = gone_after_ms(max(intervals_in(files, span, numbers).values(), default=0))
+        ((count,),) = _stream(f"SELECT count(*) FROM ({own})", files, span) if files else ((0,),)
+        counts = {
+            at_ms: counts_ms
+            for (_, t, *_), counts in fixes_in(files, span, numbers)
+            for at_ms, counts_ms in zip(t.tolist(), counts.tolist(), strict=True)
+            if counts_ms > GONE_MS
+        }
+        gap_s = 1e-3 * max(counts.values(), default=GONE_MS)
         if not count:
-            return Track(tag, (), 0, 0.0, 1e-3 * gap_ms)
-        way = _Way(count, most_points, gap_ms)
+            return Track(tag, (), 0, 0.0, gap_s)
+        way = _Way(count, most_points, counts)
         for row in _stream(f"SELECT ms, x_m, y_m, std_m FROM ({own}) ORDER BY ms", files, span):
             way.add(*row)
         kept = way.kept()
         columns = "ms / 1000, x_m, y_m, z_m, std_m, hpl_m, alert"
         sql = f"SELECT DISTINCT ON (ms) {columns} FROM ({own} AND list_contains($kept, epoch_ms(t))) ORDER BY ms"
         points = tuple(TrackPoint(*row) for row in _stream(sql, files, span, kept=kept))
-        return Track(tag, points, count, way.length_m, 1e-3 * gap_ms)
+        return Track(tag, points, count, way.length_m, gap_s)
 
     @_asked
     def heatmap(self, span: Span, cell_m: float = 0.25, tags: Sequence[str] = ()) -> Heatmap:
@@ -446,29 +246,15 @@ class History:
     def contacts(self, tag: str, span: Span, distance_m: float = 2.0) -> tuple[Contact, ...]:
         """Return when other tags were within a horizontal distance of this tag. Raises SkylessError.
 
-        The others' fixes in each second are compared with this tag's first fix in it; where one of the two sends less
-        often, those in an interval as long as its own.
+        Two tags are in contact while the newest fixes of both count, and interruptions of up to 5 s do not end it.
         """
         check_number("the distance", distance_m, least=0.01, most=LIMITS.contact_m)
         ((tag, own),) = self._tags((tag,)).items()
         names, files = self._names(), self._files(span)
-        intervals_s = intervals_in(files, span, None, _CONTACT_SHARE)
-        own_s = max(intervals_s.get(number, 0) for number in own)
-        others = defaultdict[int, list[int]](list)
-        for number in intervals_s.keys() - set(own):
-            others[_BUCKETS_S[bisect_left(_BUCKETS_S, max(own_s, intervals_s[number]))]].append(number)
+        found = [near(*part, own, round(1000.0 * distance_m)) for part in _parts(files, span)]
         contacts = [
-            Contact(
-                tag,
-                names.get(number, f"#{number}"),
-                max(float(length_s * begin), span.from_unix_s),
-                min(float(length_s * (end + 1)), span.to_unix_s),
-                1e-3 * math.sqrt(square),
-            )
-            for length_s, numbers in others.items()
-            for number, begin, end, square in joined(
-                [near(*part, own, length_s, round(1000.0 * distance_m), numbers) for part in _parts(files, span)]
-            ).T.tolist()
+            Contact(tag, names.get(number, f"#{number}"), 1e-3 * begin, 1e-3 * end, 1e-3 * math.sqrt(square))
+            for number, begin, end, square in joined(found).T.tolist()
         ]
         return tuple(sorted(contacts, key=lambda one: (one.begin_unix_s, one.other)))
 
@@ -563,29 +349,24 @@ class History:
         return found
 
 
-def gone_after_ms(interval_s: int) -> int:
-    """How long a position counts if no other follows."""
-    return round(1000.0 * THRESHOLDS.gone_after_s(interval_s, THRESHOLDS.longest_s))
-
-
 # The way of a tag
 
 
 class _Way:
     """A tag's track, built from its fixes in order of time: its length, and which fixes to keep."""
 
-    def __init__(self, count: int, most: int, gap_ms: int) -> None:
-        """Keep at most ``most`` of ``count`` fixes."""
+    def __init__(self, count: int, most: int, counts_ms: Mapping[int, int]) -> None:
+        """Keep at most ``most`` of ``count`` fixes. ``counts_ms``: by time in ms, those that count for long."""
         self.length_m = 0.0
         """Sum of moves beyond the noise, each measured from the end of the last."""
-        self._most, self._gap_ms = most, gap_ms
+        self._most, self._counts_ms = most, counts_ms
         self._step, self._index = max(1.0, (count - 1) / (most - 1)), -1
         self._evenly, self._at_gaps = array("q"), list[float]()
-        self._before_ms, self._x, self._y = -math.inf, 0.0, 0.0
+        self._before_ms, self._x, self._y = -GONE_MS, 0.0, 0.0
 
     def add(self, now_ms: int, x: float, y: float, std_m: float) -> None:
         moved_m = math.hypot(x - self._x, y - self._y)
-        is_new = now_ms - self._before_ms > self._gap_ms
+        is_new = now_ms - self._before_ms > self._counts_ms.get(self._before_ms, GONE_MS)
         if is_new or moved_m >= max(_MOVE_M, _MOVE_SIGMAS * std_m):
             self.length_m += 0.0 if is_new else moved_m
             self._x, self._y = x, y
