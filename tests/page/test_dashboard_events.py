@@ -81,6 +81,8 @@ def test_a_tag_that_sleeps_or_sends_rarely_is_not_missed_between_its_reports():
         log._table.add_fix(fix(name, NOW), NOW)
     for second in range(24):
         log.tick(NOW + second)
+    log.on_status(status("tag", "asleep", online=False), NOW + 24)
+    log.on_status(status("tag", "asleep", unix_s=NOW + 60), NOW + 60)
     assert texts(log) == ["tag ends does not report any more"]
 
 

@@ -247,8 +247,8 @@ def test_an_anchor_is_used_while_a_fix_that_used_it_is_fresh():
     assert table.get("anchor", "2").used_until_s == 2.0 + 10.0 * THRESHOLDS.fresh_intervals
 
 
-@pytest.mark.parametrize("health_first", [True, False])
-def test_a_tag_that_wakes_early_and_stops_is_gone_after_its_own_time(health_first):
+@pytest.mark.parametrize("said", [("health", "fix"), ("fix", "health"), ("fix",)])
+def test_a_tag_that_wakes_early_and_stops_is_gone_after_its_own_time(said):
     """Its announced sleep counts neither as silence nor as its interval once it is awake."""
     table = SiteTable(0.0)
     for now_s in range(20):
@@ -258,16 +258,26 @@ def test_a_tag_that_wakes_early_and_stops_is_gone_after_its_own_time(health_firs
     assert [table.tick(float(now_s)) for now_s in range(21, 600)] == [[]] * 579
     assert table.presence(table.get("tag", "t1"), 599.0) == "asleep"
     table.add_status(status("tag", "t1", online=True), 600.0)
-    for say in (True, False) if health_first else (False, True):
-        if say:
+    for word in said:
+        if word == "health":
             table.add_health("tag", "t1", tag_health(), 600.0)
         else:
             table.add_fix(fix(unix_s=600.0, serial=600), 600.0)
     for now_s in range(601, 700):
         table.add_fix(fix(unix_s=float(now_s), serial=now_s), float(now_s))
         assert table.tick(float(now_s)) == []
-    gone = {now_s: table.tick(float(now_s)) for now_s in range(700, 730)}
+    gone = {now_s: table.tick(float(now_s)) for now_s in range(700, 1700)}
     assert [now_s for now_s, tags in gone.items() if tags] == [709]
+
+
+def test_a_tag_that_sleeps_for_a_day_and_does_not_return_has_gone_before_it_is_forgotten():
+    table = SiteTable(0.0)
+    table.add_fix(fix(), 0.0)
+    table.add_health("tag", "t1", tag_health(sleeps_s=DAY_S), 1.0)
+    table.add_status(status("tag", "t1", online=False), 1.0)
+    gone = {now_s: tags for now_s in range(0, 2 * round(DAY_S) + 3600, 60) if (tags := table.tick(float(now_s)))}
+    assert [tags for now_s, tags in gone.items() if now_s > DAY_S] == [["t1"]]
+    assert table.get("tag", "t1") is None
 
 
 def test_nodes_are_in_natural_order():

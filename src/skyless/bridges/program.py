@@ -7,6 +7,7 @@ import asyncio
 import platform
 import re
 import time
+from collections import Counter
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Final
 from zlib import crc32
@@ -134,8 +135,8 @@ class BridgeNode:
         table, silent_s = self.hub.table, now_s - self._last_fix_s
         if self._is_silent or silent_s < THRESHOLDS.grace_s:
             return
-        presences = {table.presence(tag, now_s) for tag in table.fixed.values()}
-        if "late" in presences or presences <= {"gone"}:
+        presences = Counter(table.presence(tag, now_s) for tag in table.fixed.values())
+        if presences["late"] >= presences["fresh"] + presences["asleep"]:
             self._is_silent = True
             known = "no tag publishes fixes" if self._site is not None else "the site itself is not on the broker"
             self._log(f"no fix for {silent_s:.0f} s: {known}; skyless dashboard shows why")

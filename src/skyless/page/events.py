@@ -98,6 +98,7 @@ class EventLog:
         self.events: deque[Event] = deque(maxlen=MAX_LOGGED)
         """Events, the oldest first."""
         self._silent: set[tuple[str, str]] = set()  # nodes whose silence is in the list
+        self._asleep: set[tuple[str, str]] = set()  # tags that disconnected as they fell asleep
         self._paused_s = float("-inf")
         self._leader = LeaderTracker()
         self._alerts: dict[str, _Alert] = {}
@@ -119,6 +120,13 @@ class EventLog:
         happened = changed or (before is None and status.online and not kept)
         if not status.online and status.kind == "tag":
             self._end_alert(status.name, now_s)
+        node = self._table.get(*key)
+        if not status.online and node is not None and node.asleep_until_s > now_s:
+            self._asleep.add(key)
+            return
+        if status.online and key in self._asleep:
+            self._asleep.remove(key)
+            return
         if key in self._silent:
             if status.online and kept and not changed:
                 return  # repeated by the broker
@@ -149,8 +157,9 @@ class EventLog:
                 if node.health is None or node.online is False or (kind, name) in self._silent:
                     continue
                 reported_s = max(node.health_s, node.since_s or node.health_s, self._paused_s)
-                is_expected = kind != "tag" or self._table.presence(node, now_s) in ("late", "gone")
-                if now_s - reported_s > THRESHOLDS.report_s and is_expected:
+                if now_s - reported_s > THRESHOLDS.report_s and (
+                    kind != "tag" or self._table.presence(node, now_s) in ("late", "gone")
+                ):
                     self._silent.add((kind, name))
                     self._add_presence((kind, name), False, now_s, "does not report any more")
         for name, alert in self._alerts.items():

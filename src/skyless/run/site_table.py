@@ -94,7 +94,7 @@ class Node:
         *("asleep_until_s", "codes_s", "ended_unix_s", "first_s", "fix", "fix_s", "gaps"),
         *("due_s", "health", "health_s", "health_serial", "heard_s", "is_gone", "learn_s", "learnt_s"),
         *("name", "previous", "row", "sends", "serial", "since_s", "stated_s", "status", "status_serial"),
-        "used_until_s",
+        *("used_s", "used_until_s"),
     )
 
     def __init__(self, name: str) -> None:
@@ -117,7 +117,8 @@ class Node:
         self.learn_s = float("-inf")  # time when they are looked at again, besides after each gap
         self.stated_s = 0.0  # the interval that the tag states
         self.asleep_until_s = float("-inf")
-        self.used_until_s = float("-inf")  # until when a fix that used this anchor is fresh
+        self.used_s = float("-inf")  # arrival of the last fix that used this anchor
+        self.used_until_s = float("-inf")  # until when a fix that used it is fresh
         self.codes_s: float | None = None  # time since when it states that its beacons have codes
         self.serial = self.health_serial = self.status_serial = 0
         """Count of the table at the last change, for readers that want what is new."""
@@ -330,7 +331,7 @@ class SiteTable:
                 self._changed(node)
             node.asleep_until_s = now_s + sleep_s if sleep_s else min(node.asleep_until_s, now_s)
             if not node.is_gone:
-                self._look_at(node, max(now_s, node.asleep_until_s) + THRESHOLDS.gone_s)
+                self._look_at(node, now_s + THRESHOLDS.gone_s)
 
     def add_fix(self, fix: FixMessage, now_s: float, *, batched: bool = False) -> Node | None:
         """Add a tag's fix; None for one that is late or repeated, or of a tag that is not admitted.
@@ -355,7 +356,9 @@ class SiteTable:
             if used is None or not used.sends:
                 used = self.add("anchor", anchor, sends=True)
             if used is not None:
-                used.used_until_s = max(used.used_until_s, until_s)
+                used.used_s = now_s
+                if until_s > used.used_until_s:
+                    used.used_until_s = until_s
         return node
 
     def hear(self, tags: Iterable[str], now_s: float) -> dict[str, float]:
@@ -389,6 +392,8 @@ class SiteTable:
 
     def _note(self, node: Node, now_s: float) -> None:
         self._look_at(node, now_s + THRESHOLDS.gone_s)
+        if node.asleep_until_s > now_s and now_s - node.health_s > THRESHOLDS.report_s:
+            node.asleep_until_s = now_s  # it has woken without a word
         node.begin(now_s)
         node.note_fix(now_s, self.ready_s, self.longest_silence_s(node))
 
@@ -482,7 +487,8 @@ class SiteTable:
                 gone.append(name)
             else:
                 wait_s = min(max(left_s, _LOOK_S), THRESHOLDS.gone_s)  # its interval may become known meanwhile
-                self._look_at(tag, max(now_s, tag.asleep_until_s) + wait_s)
+                asleep_s = min(max(0.0, tag.asleep_until_s - now_s), THRESHOLDS.longest_s)  # it may wake earlier
+                self._look_at(tag, now_s + asleep_s + wait_s)
         if now_s - self._forget_s >= _FORGET_PERIOD_S:
             self._forget_s = now_s
             self._forget(now_s)
@@ -494,7 +500,8 @@ class SiteTable:
         for kind, nodes in self._nodes.items():
             for name, node in list(nodes.items()):
                 newest_s = max(node.fix_s, node.health_s, node.since_s or float("-inf"))
-                if not node.online and newest_s < last_s and not (kind == "anchor" and name in anchors):
+                is_old = node.is_gone and not node.online and newest_s < last_s
+                if is_old and not (kind == "anchor" and name in anchors):
                     del nodes[name]
                     self.roster.remove(kind, name)
                     self._sorted.pop(kind, None)

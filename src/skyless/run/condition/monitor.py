@@ -374,7 +374,7 @@ def _anchors(evidence: Evidence, now_s: float) -> tuple[list[str], list[str], li
             if isinstance(health, AnchorHealth) and _is_idle(health):
                 idle.append(name)
         elif node is None or node.online is not False:
-            on_air = node is not None and now_s < node.used_until_s
+            on_air = node is not None and now_s < node.used_until_s and node.used_s > node.health_s + THRESHOLDS.fresh_s
             if not evidence.table.in_grace(now_s, node):
                 (cut_off if on_air else offline).append(name)
         elif node.since_s is not None or not evidence.table.in_grace(now_s):  # else an old status, kept by the broker

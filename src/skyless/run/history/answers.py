@@ -41,7 +41,7 @@ class Track(Struct, frozen=True):
     """Length in the plane through all fixes, without gaps. Moves of less than a quarter of a metre, or three standard
     deviations, may be noise: they count only once they add up to that."""
     gap_s: float
-    """A longer time without a fix is a gap: the tag, which may send rarely, would be gone by then."""
+    """The longest silence in the range that is no absence, 10 s at least. Some shorter ones may be absences."""
 
 
 class Heatmap(Struct, frozen=True):

@@ -35,7 +35,7 @@ from skyless.run.history.layout import (
     site_folder,
     sites_in,
 )
-from skyless.run.history.scans import GONE_MS, KNOWN, fixes_in, joined, near, time_in_cells
+from skyless.run.history.scans import GONE_MS, KNOWN, check_contacts, fixes_in, joined, near, time_in_cells
 from skyless.run.history.tables import (
     check_readable,
     connection,
@@ -44,6 +44,7 @@ from skyless.run.history.tables import (
     quoted,
     read_rows,
 )
+from skyless.run.site_table import THRESHOLDS
 from skyless.run.web import HISTORY as LIMITS
 
 _EARLY: Final = timedelta(hours=1)
@@ -61,6 +62,7 @@ _MOVE_M: Final = 0.25
 _MOVE_SIGMAS: Final = 3.0
 """Shorter moves, in standard deviations of the fix, may be noise and do not lengthen a track."""
 _PART_S: Final = 28.0 * 86_400.0
+_MARGIN_S: Final = 3.0 * THRESHOLDS.longest_s
 _NAMED: Final = 5
 """How many known names an error lists."""
 
@@ -196,12 +198,10 @@ class History:
         check_number("the number of points", most_points, least=2, most=LIMITS.points)
         files, own = self._files(span), f"{_FIXES} AND tag IN ({', '.join(map(str, numbers))})"
         ((count,),) = _stream(f"SELECT count(*) FROM ({own})", files, span) if files else ((0,),)
-        counts = {
-            at_ms: counts_ms
-            for (_, t, *_), counts in fixes_in(files, span, numbers)
-            for at_ms, counts_ms in zip(t.tolist(), counts.tolist(), strict=True)
-            if counts_ms > GONE_MS
-        }
+        counts: dict[int, int] = {}
+        for (_, t, *_), counts_ms in fixes_in(files, span, numbers):
+            is_long = counts_ms > GONE_MS
+            counts.update(zip(t[is_long].tolist(), counts_ms[is_long].tolist(), strict=True))
         gap_s = 1e-3 * max(counts.values(), default=GONE_MS)
         if not count:
             return Track(tag, (), 0, 0.0, gap_s)
@@ -251,10 +251,18 @@ class History:
         check_number("the distance", distance_m, least=0.01, most=LIMITS.contact_m)
         ((tag, own),) = self._tags((tag,)).items()
         names, files = self._names(), self._files(span)
-        found = [near(*part, own, round(1000.0 * distance_m)) for part in _parts(files, span)]
+        found = []
+        for files_of_part, wide, part in _parts(files, span):
+            runs = near(files_of_part, wide, own, round(1000.0 * distance_m))
+            edges_ms = round(1000.0 * part.from_unix_s), round(1000.0 * part.to_unix_s)
+            runs = runs[:, (runs[2] >= edges_ms[0]) & (runs[1] <= edges_ms[1])]
+            runs[1:3] = runs[1:3].clip(*edges_ms)
+            found.append(runs)
+        all_parts = joined(found)
+        check_contacts(all_parts)
         contacts = [
             Contact(tag, names.get(number, f"#{number}"), 1e-3 * begin, 1e-3 * end, 1e-3 * math.sqrt(square))
-            for number, begin, end, square in joined(found).T.tolist()
+            for number, begin, end, square in all_parts.T.tolist()
         ]
         return tuple(sorted(contacts, key=lambda one: (one.begin_unix_s, one.other)))
 
@@ -405,13 +413,19 @@ def _day(unix_s: float, later: timedelta) -> str:
     return (datetime.fromtimestamp(unix_s, UTC) + later).date().isoformat()
 
 
-def _parts(files: Sequence[Path], span: Span) -> Iterator[tuple[list[Path], Span]]:
-    """Split a range into parts of four weeks, leaving out those without files."""
+def _parts(files: Sequence[Path], span: Span) -> Iterator[tuple[list[Path], Span, Span]]:
+    """Split a range into parts of four weeks with fixes; of each part its files, with a margin, that range and its own.
+
+    The margin shows whether silences at the edges are absences.
+    """
     begin_s = span.from_unix_s // _PART_S * _PART_S
     while begin_s < span.to_unix_s:
         part = Span(max(begin_s, span.from_unix_s), min(begin_s + _PART_S, span.to_unix_s))
-        if of_part := _of_days(files, part):
-            yield of_part, part
+        wide = Span(
+            max(part.from_unix_s - _MARGIN_S, span.from_unix_s), min(part.to_unix_s + _MARGIN_S, span.to_unix_s)
+        )
+        if _of_days(files, part):
+            yield _of_days(files, wide), wide, part
         begin_s += _PART_S
 
 

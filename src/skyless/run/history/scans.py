@@ -2,9 +2,9 @@
 
 They need all rows, for which NumPy takes a third of DuckDB's processor time.
 
-A fix counts until the tag's next one, also where the tag sleeps in between. A silence is an absence if it is longer
-than any tag's that is there (``run/site_table.py``), or than four others within twice its length; the fix before
-it counts only until the tag would be gone. Where nothing else is known of a tag, its silence is no absence.
+A fix counts until the tag's next one, also where the tag sleeps in between. A silence of more than 10 s is an absence,
+of which the fix before counts for as much only, unless the tag is silent about as often as not: another silence of
+similar length is near, or nothing else is known of the tag. Longer than 15 minutes it is always one.
 """
 
 import math
@@ -30,8 +30,11 @@ _THINNED_GONE_MS: Final = 65_000
 _LONGEST_MS: Final = round(1000 * THRESHOLDS.longest_s)
 _SHORT_MS: Final = round(GONE_MS / THRESHOLDS.gone_intervals)
 """Shorter times between fixes are no silence: four of them are shorter than ``GONE_MS``."""
-_NEAR_LENGTHS: Final = 2
-_NEAR_SILENCES: Final = 4
+_SIMILAR: Final = 0.4
+"""Least length of a similar silence, as a share of the shorter bound of a class of lengths of which each is twice the
+one before."""
+_KNOWN_SHARE: Final = 0.1
+"""Less time than this share of a silence is nothing known."""
 
 _Ints = NDArray[Any]
 
@@ -39,18 +42,17 @@ _Ints = NDArray[Any]
 def fixes_in(
     files: Sequence[Path], span: Span, tags: Collection[int] | None
 ) -> Iterator[tuple[tuple[_Ints, ...], _Ints]]:
-    """Yield batches of fixes (tags, times in ms, x and y in mm), and for how long in ms each counts. May repeat fixes.
+    """Yield batches of fixes (tags, times in ms, x and y in mm), and for how long in ms each counts.
 
-    A fix before a silence comes with 0, and at the end, if another one follows in whatever file, with its time.
-    ``tags`` None means all. Raises duckdb.Error.
+    Fixes before a silence come at the end, as the next one may be in any file; a tag's last fix counts 0. ``tags`` None
+    means all. Raises duckdb.Error.
     """
     edges: list[tuple[_Ints, ...]] = []
     for columns, gone_ms in _rows_in(files, span, tags):
         tag, t = columns[:2]
         counts_ms = np.append(t[1:] - t[:-1], 0)
         is_last = np.append(tag[1:] != tag[:-1], True) | (counts_ms > _SHORT_MS)
-        counts_ms[is_last] = 0
-        yield columns, counts_ms
+        yield tuple(column[~is_last] for column in columns), counts_ms[~is_last]
         is_first = np.append(True, is_last[:-1])
         more = is_first, is_last, np.full(len(tag), gone_ms, np.int32)
         edges.append(tuple(column[is_first | is_last] for column in (*columns, *more)))
@@ -65,10 +67,10 @@ def fixes_in(
     tag, t = places[:2]
     gap_ms = np.append(np.where(is_last[:-1] & is_first[1:] & (tag[1:] == tag[:-1]), np.diff(t), 0), 0)
     counts_ms = _counts_ms(tag, t, gap_ms, gone)
+    last = np.flatnonzero(is_last)
     del found, order, is_first, is_last, gone, gap_ms
-    before = np.flatnonzero(counts_ms)
-    for first in range(0, len(before), ROW_GROUP):
-        rows = before[first : first + ROW_GROUP]
+    for first in range(0, len(last), ROW_GROUP):
+        rows = last[first : first + ROW_GROUP]
         yield tuple(column[rows] for column in places), counts_ms[rows]
 
 
@@ -94,15 +96,13 @@ def _counts_ms(tag: _Ints, t: _Ints, gap_ms: _Ints, gone_ms: _Ints) -> _Ints:
     first = np.flatnonzero(np.append(True, tag[1:] != tag[:-1]))
     number = np.diff(np.append(first, len(tag)))
     known_ms = t[first + number - 1] - t[first] - np.add.reduceat(gap_ms - silent_ms, first)
-    is_usual = 2 * silent_ms > np.repeat(known_ms, number)
-    rows = np.flatnonzero(silent_ms)
-    tags, begin, length = tag[rows], t[rows], silent_ms[rows]
-    for step in range(1, _NEAR_SILENCES + 1):
-        same = tags[step:] == tags[:-step]
-        between = begin[step:] - begin[:-step] - length[:-step]
-        for own, other in ((slice(None, -step), slice(step, None)), (slice(step, None), slice(None, -step))):
-            is_like = THRESHOLDS.gone_intervals * length[other] >= length[own]
-            is_usual[rows[own]] |= same & is_like & (between <= _NEAR_LENGTHS * length[own])
+    is_usual = (1.0 + _KNOWN_SHARE) * silent_ms > np.repeat(known_ms, number)
+    for bound_ms in GONE_MS * 2 ** np.arange(math.ceil(math.log2(_LONGEST_MS / GONE_MS))):
+        rows = np.flatnonzero(silent_ms >= _SIMILAR * bound_ms)
+        length = silent_ms[rows]
+        between = np.where(tag[rows][1:] == tag[rows][:-1], t[rows][1:] - t[rows][:-1] - length[:-1], _LONGEST_MS)
+        is_near = (np.append(between, _LONGEST_MS) < length) | (np.append(_LONGEST_MS, between) < length)
+        is_usual[rows[is_near & (length > bound_ms) & (length <= 2 * bound_ms)]] = True
     return np.where(is_usual, silent_ms, np.minimum(gap_ms, gone_ms))
 
 
@@ -125,6 +125,8 @@ def time_in_cells(files: Sequence[Path], span: Span, cell_mm: int, tags: Collect
     corner: list[int] = []
     seen = set[int]()
     for (tag, _, x, y), counts_ms in fixes_in(files, span, tags):
+        if not len(tag):
+            continue
         places = x // cell_mm, y // cell_mm
         corner = corner or [int(np.median(one)) - _SIDE // 2 for one in places]
         column, row = ((one - first).view(np.uint32) for one, first in zip(places, corner, strict=True))
@@ -151,6 +153,8 @@ def time_in_cells(files: Sequence[Path], span: Span, cell_mm: int, tags: Collect
 
 _PAUSE_MS: Final = 5000
 """The longest interruption of a contact."""
+_RARE_MS: Final = 1500
+"""A fix that counts for longer is compared with all of the other tag's while it counts, others with the newest."""
 
 
 def near(files: Sequence[Path], span: Span, own: Collection[int], distance_mm: int) -> NDArray[np.int64]:
@@ -167,37 +171,35 @@ def near(files: Sequence[Path], span: Span, own: Collection[int], distance_mm: i
     nth = np.unique(whole[0] // 1000, return_index=True)[1]
     own_t, own_x, own_y = whole[:3, nth]
     own_end = np.minimum(np.maximum.reduceat(whole[3], nth), np.append(own_t[1:], whole[3].max()))
-    runs: list[NDArray[np.int64]] = []
 
-    def compare(fixes: tuple[_Ints, ...], ends: _Ints, at: _Ints) -> None:
+    def compared(fixes: tuple[_Ints, ...], ends: _Ints, at: _Ints) -> NDArray[np.int64]:
         """Compare fixes with those of ``own`` at the places ``at``, if both count at a time."""
         rows = np.flatnonzero(np.abs(fixes[2] - own_x[at]) <= distance_mm)
         rows = rows[np.abs(fixes[3][rows] - own_y[at[rows]]) <= distance_mm]
         (tag, t, x, y), at = (column[rows] for column in fixes), at[rows]
         begin, end = np.maximum(t, own_t[at]), np.minimum(ends[rows], own_end[at])
         found = np.array([tag, begin, end, (x - own_x[at]) ** 2 + (y - own_y[at]) ** 2], np.int64)
-        runs.append(joined([found[:, (begin <= end) & (found[3] <= distance_mm**2) & ~np.isin(tag, list(own))]]))
-        if sum(one.shape[1] for one in runs) > 2 * LIMITS.contacts:
-            runs[:] = [joined(runs)]
+        return found[:, (begin <= end) & (found[3] <= distance_mm**2) & ~np.isin(tag, list(own))]
 
+    runs: list[NDArray[np.int64]] = []
     for columns, counts_ms in fixes_in(files, span, None):
         t, ends = columns[1], columns[1] + counts_ms
-        compare(columns, ends, np.searchsorted(own_t, t, side="right") - 1)
-        rare = np.flatnonzero(counts_ms > _SHORT_MS)
+        runs.append(compared(columns, ends, np.searchsorted(own_t, t, side="right") - 1))
+        rare = np.flatnonzero(counts_ms > _RARE_MS)
         first, end = np.searchsorted(own_t, t[rare], side="right"), np.searchsorted(own_t, ends[rare])
         for part in np.array_split(np.arange(len(rare)), 1 + (end - first).sum() // ROW_GROUP):
             number = (end - first)[part]
             rows = np.repeat(rare[part], number)
             at = np.arange(len(rows)) + np.repeat(first[part] - np.cumsum(number) + number, number)
-            compare(tuple(column[rows] for column in columns), ends[rows], at)
+            runs.append(compared(tuple(column[rows] for column in columns), ends[rows], at))
+        if sum(one.shape[1] for one in runs) > 10 * LIMITS.contacts:
+            runs = [joined(runs)]
+            check_contacts(runs[0])
     return joined(runs)
 
 
 def joined(parts: Sequence[NDArray[np.int64]]) -> NDArray[np.int64]:
-    """Join contacts with the same tag that have at most ``_PAUSE_MS`` between them.
-
-    Raises SkylessError if there are too many.
-    """
+    """Join contacts with the same tag that have at most ``_PAUSE_MS`` between them."""
     runs = np.concatenate([np.empty((4, 0), np.int64), *parts], axis=1)
     if not runs.size:
         return runs
@@ -206,6 +208,10 @@ def joined(parts: Sequence[NDArray[np.int64]]) -> NDArray[np.int64]:
     later = np.cumsum(is_other) * (end.max() - begin.min() + _PAUSE_MS + 1)  # each tag after the one before
     until = np.maximum.accumulate(end + later)
     first = np.flatnonzero(np.append(True, (begin + later)[1:] > until[:-1] + _PAUSE_MS))
-    if len(first) > LIMITS.contacts:
-        raise SkylessError("the contacts are too many; choose a shorter range or a smaller distance")
     return np.array([tag[first], begin[first], np.maximum.reduceat(end, first), np.minimum.reduceat(square, first)])
+
+
+def check_contacts(found: NDArray[np.int64]) -> None:
+    """Raise SkylessError if there are too many."""
+    if found.shape[1] > LIMITS.contacts:
+        raise SkylessError("the contacts are too many; choose a shorter range or a smaller distance")
