@@ -3,8 +3,8 @@
 They need all rows, for which NumPy takes a third of DuckDB's processor time.
 
 A fix counts until the tag's next one, also where the tag sleeps in between. A silence of more than 10 s is an absence,
-of which the fix before counts for as much only, unless the tag is silent about as often as not: another silence of
-similar length is near, or nothing else is known of the tag. Longer than 15 minutes it is always one.
+and the fix before it counts for 10 s only, unless the tag sends rarely there: another silence of similar length is
+nearer than its own length, or nothing else is known of the tag. More than 15 minutes are always an absence.
 """
 
 import math
@@ -31,10 +31,10 @@ _LONGEST_MS: Final = round(1000 * THRESHOLDS.longest_s)
 _SHORT_MS: Final = round(GONE_MS / THRESHOLDS.gone_intervals)
 """Shorter times between fixes are no silence: four of them are shorter than ``GONE_MS``."""
 _SIMILAR: Final = 0.4
-"""Least length of a similar silence, as a share of the shorter bound of a class of lengths of which each is twice the
-one before."""
+"""Silences are compared in classes of lengths, each from a bound to twice the bound: one that has this share of the
+bound at least is similar to all of the class."""
 _KNOWN_SHARE: Final = 0.1
-"""Less time than this share of a silence is nothing known."""
+"""If less time than this share of a silence is known besides it, nothing is known of the tag."""
 
 _Ints = NDArray[Any]
 
