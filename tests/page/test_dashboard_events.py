@@ -81,9 +81,32 @@ def test_a_tag_that_sleeps_or_sends_rarely_is_not_missed_between_its_reports():
         log._table.add_fix(fix(name, NOW), NOW)
     for second in range(24):
         log.tick(NOW + second)
-    log.on_status(status("tag", "asleep", online=False), NOW + 24)
-    log.on_status(status("tag", "asleep", unix_s=NOW + 60), NOW + 60)
     assert texts(log) == ["tag ends does not report any more"]
+
+
+@pytest.mark.parametrize("disconnects", [True, False])
+def test_a_tag_that_wakes_a_little_late_is_not_missed_and_one_that_does_not_wake_is_once(disconnects):
+    log, now_s = Log(), NOW
+    log.on_status(status("tag", "t1", unix_s=now_s), now_s)
+    log.on_health("tag", "t1", tag_health(), now_s)
+    before = log.serial
+    for cycle in range(5):
+        if disconnects and cycle:
+            log.on_status(status("tag", "t1", unix_s=now_s), now_s)
+        log._table.add_fix(fix("t1", now_s, serial=cycle + 1), now_s)
+        log.on_health("tag", "t1", tag_health(sleeps_s=60.0), now_s)
+        if disconnects:
+            log.on_status(status("tag", "t1", online=False), now_s + 0.1)
+        for second in range(1, 63):
+            log.tick(now_s + second)
+        now_s += 62.5
+    assert texts(log, before) == []
+    log.tick(now_s + 2.0)
+    log.tick(now_s + 9.0)
+    log.on_status(status("tag", "t1", unix_s=now_s + 20), now_s + 20)
+    log.on_health("tag", "t1", tag_health(), now_s + 20)
+    back = "tag t1 is online" if disconnects else "tag t1 reports again"
+    assert texts(log, before) == ["tag t1 does not report any more", back]
 
 
 def test_a_status_that_the_broker_repeats_is_no_start():

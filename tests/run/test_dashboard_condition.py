@@ -191,6 +191,23 @@ def test_a_tag_is_not_missed_before_its_first_fix_could_have_come():
     assert hall.run(3.0).reasons[0].kind == "no-fixes"
 
 
+def test_a_tag_that_wakes_a_little_late_is_not_missed():
+    hall = Hall(("t1",)).start()
+    hall.run(10.0)
+    hall.tags = {"t1": {"sleeps_s": 20.0}}
+    hall.run(0.2)
+    hall.silent = {"t1"}
+    health = hall.evidence.table.get("tag", "t1").health
+    hall.evidence.add_health("tag", "t1", health, hall.now_s, 1e9 + hall.now_s)
+    reasons = []
+    for _ in range(49):
+        hall.now_s += 0.5
+        reasons += hall.monitor.evaluate(hall.now_s).reasons
+    assert not [reason for reason in reasons if reason.kind in ("no-fix", "no-fixes")]
+    hall.now_s += 2.0
+    assert "no-fixes" in [reason.kind for reason in hall.monitor.evaluate(hall.now_s).reasons]
+
+
 def test_each_tag_has_the_cause_that_it_gives():
     """Of some tags, then of all."""
     hall = Hall(("t1", "t2", "t3", "t4")).start()

@@ -2,6 +2,7 @@
 
 import csv
 import math
+import re
 from bisect import bisect_left, bisect_right
 from collections import defaultdict
 from datetime import UTC, datetime
@@ -33,6 +34,7 @@ from support.parquet_files import arrow_table
 pytestmark = pytest.mark.site
 
 SITE, TAGS, FIXES = 7, 20, 5000
+DOCUMENT = Path(__file__).parents[2] / "docs" / "history.md"
 MIDNIGHT = datetime(2026, 11, 20, tzinfo=UTC).timestamp()
 BEGIN = MIDNIGHT - 2000.0
 SPAN = Span(BEGIN + 500.0, BEGIN + 4000.25)
@@ -525,7 +527,7 @@ def test_sql_sees_every_fix_of_the_range(history, within, tmp_path):
 
 
 def test_sql_answers_what_the_questions_do_not(history):
-    """Alarms that overlap a range, and how full a zone was."""
+    """Alarms that overlap a range, and the document's examples, such as how full a zone was."""
     alarms = f"""
         SELECT alarm, min(unix_s) FILTER (kind = 'alarm-raised') AS raised,
             max(unix_s) FILTER (kind = 'alarm-ended') AS ended
@@ -534,11 +536,11 @@ def test_sql_answers_what_the_questions_do_not(history):
     """
     found = history.sql(alarms, Span(0.0, SPAN.to_unix_s))
     assert [(one["alarm"], one["ended"]) for one in found] == [("r/tag1/2", BEGIN + 600.0), ("s/tag1+tag2/3", None)]
-    inside = """
-        SELECT zone, sum(CASE kind WHEN 'enter' THEN 1 ELSE -1 END) OVER (PARTITION BY zone ORDER BY unix_s) AS tags
-        FROM events JOIN zones USING (zone) WHERE kind IN ('enter', 'leave') AND tag = 'tag4' ORDER BY unix_s
-    """
-    assert [(one["zone"], one["tags"]) for one in history.sql(inside, Span(0.0, 1e10))] == [("b", 1), ("b", 0)]
+    stated = re.findall(r'^skyless history sql "(.*?)"', DOCUMENT.read_text(), re.MULTILINE | re.DOTALL)
+    answers = [history.sql(query, Span(0.0, 1e10)) for query in stated]
+    (most,) = [rows for query, rows in zip(stated, answers, strict=True) if "AS most" in query]
+    hours = [(one["name"], one["hour_utc"].hour, one["most"]) for one in most]
+    assert hours == [("", 23, 1), ("", 0, 2), ("Hall", 23, 2), ("Hall", 0, 2)]
     assert {"tag": "tag3", "name": "Forklift"} in history.sql("FROM assets", SPAN)
 
 

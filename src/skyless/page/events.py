@@ -126,7 +126,8 @@ class EventLog:
             return
         if status.online and key in self._asleep:
             self._asleep.remove(key)
-            return
+            if key not in self._silent:
+                return
         if key in self._silent:
             if status.online and kept and not changed:
                 return  # repeated by the broker
@@ -154,14 +155,15 @@ class EventLog:
         """Find alerts that have ended and nodes that fell silent. To be called once or twice a second."""
         for kind in self._table.kinds:
             for name, node in self._table.senders(kind):
-                if node.health is None or node.online is False or (kind, name) in self._silent:
+                key, has_ended = (kind, name), node.online is False and (kind, name) not in self._asleep
+                if node.health is None or has_ended or key in self._silent:
                     continue
-                reported_s = max(node.health_s, node.since_s or node.health_s, self._paused_s)
+                reported_s = max(node.health_s, node.since_s or node.health_s, node.asleep_until_s, self._paused_s)
                 if now_s - reported_s > THRESHOLDS.report_s and (
                     kind != "tag" or self._table.presence(node, now_s) in ("late", "gone")
                 ):
-                    self._silent.add((kind, name))
-                    self._add_presence((kind, name), False, now_s, "does not report any more")
+                    self._silent.add(key)
+                    self._add_presence(key, False, now_s, "does not report any more")
         for name, alert in self._alerts.items():
             if alert.alert is not None and now_s - alert.seen_s > ALERT_END_S:
                 self._end_alert(name, now_s)

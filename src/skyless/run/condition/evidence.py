@@ -73,8 +73,8 @@ class Evidence:
             self.alerts[tag] = str(alert)
 
     def has_fix(self, tag: Node, now_s: float) -> bool:
-        """Whether a tag has a fresh fix, or sleeps."""
-        return tag.asleep_until_s > now_s or self.table.is_fresh(tag, now_s)
+        """Whether a tag has a fresh fix, or sleeps, or has just woken."""
+        return now_s - tag.asleep_until_s < THRESHOLDS.grace_s or self.table.is_fresh(tag, now_s)
 
     def missed(self, now_s: float) -> list[str]:
         """Tags known only from batches that have gone, and not for long."""

@@ -198,14 +198,14 @@ class History:
         check_number("the number of points", most_points, least=2, most=LIMITS.points)
         files, own = self._files(span), f"{_FIXES} AND tag IN ({', '.join(map(str, numbers))})"
         ((count,),) = _stream(f"SELECT count(*) FROM ({own})", files, span) if files else ((0,),)
-        counts: dict[int, int] = {}
-        for (_, t, *_), counts_ms in fixes_in(files, span, numbers):
-            is_long = counts_ms > GONE_MS
-            counts.update(zip(t[is_long].tolist(), counts_ms[is_long].tolist(), strict=True))
-        gap_s = 1e-3 * max(counts.values(), default=GONE_MS)
+        valid: dict[int, int] = {}
+        for (_, t, *_), valid_ms in fixes_in(files, span, numbers):
+            is_long = valid_ms > GONE_MS
+            valid.update(zip(t[is_long].tolist(), valid_ms[is_long].tolist(), strict=True))
+        gap_s = 1e-3 * max(valid.values(), default=GONE_MS)
         if not count:
             return Track(tag, (), 0, 0.0, gap_s)
-        way = _Way(count, most_points, counts)
+        way = _Way(count, most_points, valid)
         for row in _stream(f"SELECT ms, x_m, y_m, std_m FROM ({own}) ORDER BY ms", files, span):
             way.add(*row)
         kept = way.kept()
@@ -246,7 +246,7 @@ class History:
     def contacts(self, tag: str, span: Span, distance_m: float = 2.0) -> tuple[Contact, ...]:
         """Return when other tags were within a horizontal distance of this tag. Raises SkylessError.
 
-        Two tags are in contact while the newest fixes of both count, and interruptions of up to 5 s do not end it.
+        Two tags are in contact while the newest fixes of both are valid, and interruptions of up to 5 s do not end it.
         """
         check_number("the distance", distance_m, least=0.01, most=LIMITS.contact_m)
         ((tag, own),) = self._tags((tag,)).items()
@@ -363,18 +363,18 @@ class History:
 class _Way:
     """A tag's track, built from its fixes in order of time: its length, and which fixes to keep."""
 
-    def __init__(self, count: int, most: int, counts_ms: Mapping[int, int]) -> None:
-        """Keep at most ``most`` of ``count`` fixes. ``counts_ms``: by time in ms, those that count for long."""
+    def __init__(self, count: int, most: int, valid_ms: Mapping[int, int]) -> None:
+        """Keep at most ``most`` of ``count`` fixes. ``valid_ms``: by time in ms, those that are valid for long."""
         self.length_m = 0.0
         """Sum of moves beyond the noise, each measured from the end of the last."""
-        self._most, self._counts_ms = most, counts_ms
+        self._most, self._valid_ms = most, valid_ms
         self._step, self._index = max(1.0, (count - 1) / (most - 1)), -1
         self._evenly, self._at_gaps = array("q"), list[float]()
         self._before_ms, self._x, self._y = -GONE_MS, 0.0, 0.0
 
     def add(self, now_ms: int, x: float, y: float, std_m: float) -> None:
         moved_m = math.hypot(x - self._x, y - self._y)
-        is_new = now_ms - self._before_ms > self._counts_ms.get(self._before_ms, GONE_MS)
+        is_new = now_ms - self._before_ms > self._valid_ms.get(self._before_ms, GONE_MS)
         if is_new or moved_m >= max(_MOVE_M, _MOVE_SIGMAS * std_m):
             self.length_m += 0.0 if is_new else moved_m
             self._x, self._y = x, y

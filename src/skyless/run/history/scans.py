@@ -1,10 +1,10 @@
-"""Passes over all fixes of a range: for how long each fix counts, times in cells, and contacts.
+"""Passes over all fixes of a range: for how long each fix is valid, times in cells, and contacts.
 
 They need all rows, for which NumPy takes a third of DuckDB's processor time.
 
-A fix counts until the tag's next one, also where the tag sleeps in between. A silence of more than 10 s is an absence,
-and the fix before it counts for 10 s only, unless the tag sends rarely there: another silence of similar length is
-nearer than its own length, or nothing else is known of the tag. More than 15 minutes are always an absence.
+A fix is valid until the tag's next one, also where the tag sleeps in between. A silence of more than 10 s is an
+absence, and the fix before it is valid for 10 s only, unless the tag sends rarely there: another silence of similar
+length is nearer than its own length, or nothing else is known of the tag. More than 15 minutes are always an absence.
 """
 
 import math
@@ -42,17 +42,17 @@ _Ints = NDArray[Any]
 def fixes_in(
     files: Sequence[Path], span: Span, tags: Collection[int] | None
 ) -> Iterator[tuple[tuple[_Ints, ...], _Ints]]:
-    """Yield batches of fixes (tags, times in ms, x and y in mm), and for how long in ms each counts.
+    """Yield batches of fixes (tags, times in ms, x and y in mm), and for how long in ms each is valid.
 
-    Fixes before a silence come at the end, as the next one may be in any file; a tag's last fix counts 0. ``tags`` None
+    Fixes before a silence come at the end, as the next one may be in any file; a tag's last fix has 0. ``tags`` None
     means all. Raises duckdb.Error.
     """
     edges: list[tuple[_Ints, ...]] = []
     for columns, gone_ms in _rows_in(files, span, tags):
         tag, t = columns[:2]
-        counts_ms = np.append(t[1:] - t[:-1], 0)
-        is_last = np.append(tag[1:] != tag[:-1], True) | (counts_ms > _SHORT_MS)
-        yield tuple(column[~is_last] for column in columns), counts_ms[~is_last]
+        valid_ms = np.append(t[1:] - t[:-1], 0)
+        is_last = np.append(tag[1:] != tag[:-1], True) | (valid_ms > _SHORT_MS)
+        yield tuple(column[~is_last] for column in columns), valid_ms[~is_last]
         is_first = np.append(True, is_last[:-1])
         more = is_first, is_last, np.full(len(tag), gone_ms, np.int32)
         edges.append(tuple(column[is_first | is_last] for column in (*columns, *more)))
@@ -66,12 +66,12 @@ def fixes_in(
     *places, is_first, is_last, gone = found
     tag, t = places[:2]
     gap_ms = np.append(np.where(is_last[:-1] & is_first[1:] & (tag[1:] == tag[:-1]), np.diff(t), 0), 0)
-    counts_ms = _counts_ms(tag, t, gap_ms, gone)
+    valid_ms = _valid_ms(tag, t, gap_ms, gone)
     last = np.flatnonzero(is_last)
     del found, order, is_first, is_last, gone, gap_ms
     for first in range(0, len(last), ROW_GROUP):
         rows = last[first : first + ROW_GROUP]
-        yield tuple(column[rows] for column in places), counts_ms[rows]
+        yield tuple(column[rows] for column in places), valid_ms[rows]
 
 
 def _rows_in(
@@ -90,8 +90,8 @@ def _rows_in(
                 yield part, _THINNED_GONE_MS if THINNED in metadata else GONE_MS
 
 
-def _counts_ms(tag: _Ints, t: _Ints, gap_ms: _Ints, gone_ms: _Ints) -> _Ints:
-    """For how long fixes count, by tag and time, before gaps in ms, which are 0 where there is no silence."""
+def _valid_ms(tag: _Ints, t: _Ints, gap_ms: _Ints, gone_ms: _Ints) -> _Ints:
+    """For how long fixes are valid, by tag and time, before gaps in ms, which are 0 where there is no silence."""
     silent_ms = np.where(gap_ms > _LONGEST_MS, 0, gap_ms)
     first = np.flatnonzero(np.append(True, tag[1:] != tag[:-1]))
     number = np.diff(np.append(first, len(tag)))
@@ -124,7 +124,7 @@ def time_in_cells(files: Sequence[Path], span: Span, cell_mm: int, tags: Collect
     sums_ms = np.zeros(_OUTSIDE + 1, np.int64)
     corner: list[int] = []
     seen = set[int]()
-    for (tag, _, x, y), counts_ms in fixes_in(files, span, tags):
+    for (tag, _, x, y), valid_ms in fixes_in(files, span, tags):
         if not len(tag):
             continue
         places = x // cell_mm, y // cell_mm
@@ -133,8 +133,8 @@ def time_in_cells(files: Sequence[Path], span: Span, cell_mm: int, tags: Collect
         cell = (row * np.uint32(_SIDE) + column).astype(np.intp)
         if column.max() >= _SIDE or row.max() >= _SIDE:  # negative ones are large as unsigned numbers
             cell[(column >= _SIDE) | (row >= _SIDE)] = _OUTSIDE
-        np.add.at(sums_ms, cell, counts_ms)  # fast for these types only
-        seen.update(tag[counts_ms == 0].tolist())
+        np.add.at(sums_ms, cell, valid_ms)  # fast for these types only
+        seen.update(tag[valid_ms == 0].tolist())
     if sums_ms[_OUTSIDE] > _WILD_SHARE * sums_ms.sum():
         raise SkylessError(f"cells of {1e-3 * cell_mm:g} m are too many; choose larger ones")
     grid, cell_m = sums_ms[:_OUTSIDE].reshape(_SIDE, _SIDE), 1e-3 * cell_mm
@@ -154,16 +154,16 @@ def time_in_cells(files: Sequence[Path], span: Span, cell_mm: int, tags: Collect
 _PAUSE_MS: Final = 5000
 """The longest interruption of a contact."""
 _RARE_MS: Final = 1500
-"""A fix that counts for longer is compared with all of the other tag's while it counts, others with the newest."""
+"""A fix that is valid for longer is compared with all of the other tag's meanwhile, others with the newest."""
 
 
 def near(files: Sequence[Path], span: Span, own: Collection[int], distance_mm: int) -> NDArray[np.int64]:
-    """Find when other tags were near the tag with the numbers ``own``: while the newest fixes of both count.
+    """Find when other tags were near the tag with the numbers ``own``: while the newest fixes of both are valid.
 
     Returns a row each for tags, begins and ends in ms, and least squared distances in mm². Of ``own``, the first fix in
     a second is used. Raises duckdb.Error; SkylessError if there are too many contacts.
     """
-    fixes = [np.array([t, x, y, t + counts_ms], np.int64) for (_, t, x, y), counts_ms in fixes_in(files, span, own)]
+    fixes = [np.array([t, x, y, t + valid_ms], np.int64) for (_, t, x, y), valid_ms in fixes_in(files, span, own)]
     if not fixes:
         return np.empty((4, 0), np.int64)
     whole = np.concatenate(fixes, axis=1)
@@ -173,7 +173,7 @@ def near(files: Sequence[Path], span: Span, own: Collection[int], distance_mm: i
     own_end = np.minimum(np.maximum.reduceat(whole[3], nth), np.append(own_t[1:], whole[3].max()))
 
     def compared(fixes: tuple[_Ints, ...], ends: _Ints, at: _Ints) -> NDArray[np.int64]:
-        """Compare fixes with those of ``own`` at the places ``at``, if both count at a time."""
+        """Compare fixes with those of ``own`` at the places ``at``, if both are valid at a time."""
         rows = np.flatnonzero(np.abs(fixes[2] - own_x[at]) <= distance_mm)
         rows = rows[np.abs(fixes[3][rows] - own_y[at[rows]]) <= distance_mm]
         (tag, t, x, y), at = (column[rows] for column in fixes), at[rows]
@@ -182,10 +182,10 @@ def near(files: Sequence[Path], span: Span, own: Collection[int], distance_mm: i
         return found[:, (begin <= end) & (found[3] <= distance_mm**2) & ~np.isin(tag, list(own))]
 
     runs: list[NDArray[np.int64]] = []
-    for columns, counts_ms in fixes_in(files, span, None):
-        t, ends = columns[1], columns[1] + counts_ms
+    for columns, valid_ms in fixes_in(files, span, None):
+        t, ends = columns[1], columns[1] + valid_ms
         runs.append(compared(columns, ends, np.searchsorted(own_t, t, side="right") - 1))
-        rare = np.flatnonzero(counts_ms > _RARE_MS)
+        rare = np.flatnonzero(valid_ms > _RARE_MS)
         first, end = np.searchsorted(own_t, t[rare], side="right"), np.searchsorted(own_t, ends[rare])
         for part in np.array_split(np.arange(len(rare)), 1 + (end - first).sum() // ROW_GROUP):
             number = (end - first)[part]
