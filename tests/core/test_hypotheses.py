@@ -5,8 +5,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from skyless.core.estimator.hypotheses import give_up_hypotheses, scatter, settle_hypotheses, take_cycles
-from skyless.core.estimator.kalman import compute_fault_input, compute_ph, update
+from skyless.core.estimator.hypotheses import (
+    give_up_hypotheses,
+    scatter,
+    settle_hypotheses,
+    spread_of_h,
+    take_cycles,
+)
+from skyless.core.estimator.kalman import add_clock_noise, compute_fault_input, compute_ph, predict, update
 from skyless.core.estimator.measurements import add_term
 from skyless.core.estimator.monitor import learn_least_walk, motion_covariance
 from skyless.core.estimator.phases import _count_wild
@@ -81,6 +87,11 @@ def test_hypotheses_are_a_mixture_of_filters_with_one_covariance(seed, kinds):
         off, variance = float(draw.normal(0.0, 0.02)), float(draw.uniform(1e-6, 1e-4))
         value = h @ view(s.x)[: s.used] + off
         predicted = measure(s, h)
+        offs = (np.array(mixture.x) - mixture.mean_and_scatter()[0]) @ h
+        likely, weights = np.argmax(mixture.log_weight), np.exp(mixture.log_weight - mixture.log_weight.max())
+        wrapped = np.remainder(offs - offs[likely] + CYCLE_M / 2, CYCLE_M) - CYCLE_M / 2
+        spread = (offs[likely], weights @ wrapped**2 / weights.sum())
+        assert spread_of_h(s, CYCLE_M) == pytest.approx(spread, abs=1e-9)
         if is_phase:
             assert take_cycles(s, off, predicted + variance, 4.0 * np.sqrt(predicted + variance), CYCLE_M) == (
                 s.hypotheses.found > 0
@@ -102,6 +113,22 @@ def test_hypotheses_are_a_mixture_of_filters_with_one_covariance(seed, kinds):
     give_up_hypotheses(s)
     assert s.hypotheses.count == 0
     np.testing.assert_allclose(covariances(s)[: s.used, : s.used], whole, atol=1e-10)
+
+
+@settings(max_examples=15, deadline=None)
+@given(seed=st.integers(0, 10**6), parts=st.lists(st.floats(0.0, 0.1), min_size=1, max_size=5))
+def test_noise_of_a_clock_is_the_same_in_parts_and_later(seed, parts):
+    """Against the noise that time updates add at once, in a state whose relays are not processed in order."""
+    once, later = (state_of(np.random.default_rng(seed)) for _ in range(2))
+    once.status.is_in_order = False
+    ends = np.round(np.cumsum(parts) / TICK_S).astype(int).tolist()
+    for s in (once, later):
+        s.settings.walk, s.settings.white = 2.0, 1e-5
+        predict(s, ends[-1])
+    for anchor in range(ANCHORS):
+        for end in ends:
+            add_clock_noise(later, anchor, end)
+    np.testing.assert_allclose(covariances(later), covariances(once), rtol=1e-9, atol=1e-12)
 
 
 @pytest.mark.parametrize(("anchors_walk", "tag_walk"), [(2.25, 0.09), (0.09, 2.25), (0.05, 0.05)])

@@ -1,12 +1,14 @@
 """Phases of the carrier: what they must not depend on, what they must not harm, and what they buy."""
 
 from functools import partial
+from itertools import permutations
 
 import numpy as np
 import pytest
 from msgspec.structs import replace
 
 from skyless.core.any_receiver import AnyReceiver
+from skyless.core.ticks import TICK_M
 from skyless.research.studies.runner import Plan
 from skyless.research.studies.worlds import Heard, Run, beacons_of, box, run_world, worlds
 from skyless.sim.evaluation.scenarios import Request, Room, impairments_of, trajectories_of, wanderer
@@ -17,17 +19,23 @@ SITE = lab_site()
 USUAL = CarrierModel()
 
 
-def heard(seed, seconds=4.0, tags=1, carrier=USUAL):
+def heard(seed, seconds=4.0, tags=1, carrier=USUAL, site=SITE, room=Room()):  # noqa: B008 - frozen
     """What tags of a room receive."""
-    request = Request(SITE, seed=seed, tags=tags, room=Room())
-    impairments = replace(impairments_of(request, SITE), carrier=carrier)
+    request = Request(site, seed=seed, tags=tags, room=room)
+    impairments = replace(impairments_of(request, site), carrier=carrier)
     paths = tuple(trajectories_of(request))
-    return list(beacons_of(Run(SITE, paths, impairments, seed, "joint", 0.0, seconds)))
+    return list(beacons_of(Run(site, paths, impairments, seed, "joint", 0.0, seconds)))
+
+
+def plain(rate_hz, *, relays_phases=True):
+    """The lab with plain crystals and beacons at this rate of each anchor."""
+    schedule = replace(SITE.schedule, rate_hz=rate_hz, carrier_phase=relays_phases)
+    return replace(SITE, noise=replace(SITE.noise, random_walk_fm=5e-9), schedule=schedule)
 
 
 @pytest.fixture(scope="module")
 def beacons():
-    return heard(3)
+    return heard(3, 6.0)
 
 
 def with_phases(beacons: list[Heard], change):
@@ -86,6 +94,20 @@ def test_a_reset_of_a_radio_is_found(beacons):
     assert np.nanmax(np.abs(after - as_they_are)) < 0.03
 
 
+@pytest.mark.parametrize(("rate_hz", "seconds"), [(67.0, 5.0), (17.0, 15.0)])
+def test_constants_of_pairs_are_those_of_the_radios(rate_hz, seconds):
+    """One of each sender and one of each listener: what four pairs have is not independent."""
+    beacons = heard(3, seconds, site=plain(rate_hz), room=Room(axis_std_m=0.0))
+    _, s = fixes_of(with_phases(beacons, lambda _, one: one.carrier_phase_cycles))
+    wavelength_m, worst_m = 128 / 13 * TICK_M, 0.0
+    for i, j, k, l in permutations(range(s.count), 4):  # noqa: E741
+        links = (s.links[i][k], s.links[j][l], s.links[i][l], s.links[j][k])
+        assert max(link.phase_variance_m2 for link in links) < 1e-3**2
+        off_m = links[0].phase_m + links[1].phase_m - links[2].phase_m - links[3].phase_m
+        worst_m = max(worst_m, abs(off_m - round(off_m / wavelength_m) * wavelength_m))
+    assert worst_m < 4e-3
+
+
 @pytest.mark.statistical
 @pytest.mark.parametrize(
     ("carrier", "most"),
@@ -111,23 +133,25 @@ def test_the_room_with_phases_against_the_room_by_stamps(carrier, most):
 
 @pytest.mark.statistical
 @pytest.mark.parametrize(
-    ("rate_hz", "random_walk_fm", "carrier", "body", "most"),
+    ("site", "qa", "carrier", "body", "most"),
     [
-        (67.0, 5e-9, USUAL, None, 0.7),
-        (10.0, 5e-9, USUAL, None, 1.05),
-        (67.0, 5e-9, CarrierModel(wild=0.1), None, 1.05),
-        (67.0, 5e-9, CarrierModel(slips=0.01), None, 1.0),
-        (67.0, 5e-9, USUAL, Body(), 1.15),
+        (plain(67.0), 3.0, USUAL, None, 0.65),
+        (plain(17.0), 3.0, USUAL, None, 1.0),
+        (plain(17.0), 0.3, USUAL, None, 0.8),
+        (plain(67.0, relays_phases=False), 3.0, USUAL, None, 0.7),
+        (plain(10.0, relays_phases=False), 3.0, USUAL, None, 1.05),
+        (plain(67.0, relays_phases=False), 3.0, CarrierModel(wild=0.1), None, 1.05),
+        (plain(67.0, relays_phases=False), 3.0, CarrierModel(slips=0.01), None, 1.0),
+        (plain(67.0, relays_phases=False), 3.0, USUAL, Body(), 1.15),
     ],
 )
-def test_hands_with_phases_against_hands_by_stamps(rate_hz, random_walk_fm, carrier, body, most):
-    """The same receptions of tags in hands, plain crystals; levels are exceeded as often, but for 10⁻³ of the fixes."""
-    noise, schedule = replace(SITE.noise, random_walk_fm=random_walk_fm), replace(SITE.schedule, rate_hz=rate_hz)
-    site, (low_m, high_m) = replace(SITE, noise=noise, schedule=schedule), box(SITE)
+def test_phases_in_hands_and_walking_against_stamps(site, qa, carrier, body, most):
+    """The same receptions of tags, plain crystals; levels are exceeded as often, but for 10⁻³ of the fixes."""
+    low_m, high_m = box(SITE)
     plan = Plan(worlds=4, seed=5, seconds=10.0, conditions="phase", tags=4)
 
     def paths(seed):
-        return [wanderer(low_m, high_m, seed, tag, 3.0) for tag in range(plan.tags)]
+        return [wanderer(low_m, high_m, seed, tag, qa) for tag in range(plan.tags)]
 
     def tallies(of):
         change = partial(replace, carrier=of)

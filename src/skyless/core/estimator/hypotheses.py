@@ -125,6 +125,23 @@ def scatter(s: State, state: int, other: int) -> float:
     return total
 
 
+def spread_of_h(s: State, cycle_m: float) -> tuple[float, float]:
+    """Deviation of the measurement in ``h`` by the most likely hypothesis, and the others' variance modulo a cycle."""
+    hypotheses, likely, first, total = s.hypotheses, 0, FAULT_KINDS * s.count, 0.0
+    if hypotheses.count == 0:
+        return 0.0, 0.0
+    for one in range(hypotheses.count):
+        if hypotheses.weight[one] > hypotheses.weight[likely]:
+            likely = one
+        hypotheses.old[one] = 0.0
+        for term in range(s.terms):
+            hypotheses.old[one] += s.h[term] * s.V[s.h_index[term]][first + one]
+    for one in range(hypotheses.count):
+        off_m = hypotheses.old[one] - hypotheses.old[likely]
+        total += hypotheses.weight[one] * square(off_m - floor(off_m / cycle_m + 0.5) * cycle_m)
+    return hypotheses.old[likely], total
+
+
 def give_up_hypotheses(s: State) -> None:
     """Replace all hypotheses by their mean. P gains their scatter."""
     hypotheses, first = s.hypotheses, FAULT_KINDS * s.count

@@ -49,15 +49,37 @@ def predict(s: State, rx_ticks: Ticks) -> None:
     square_s, cube_s = dt * dt / 2.0, dt * dt * dt / 3.0
     for axis in range(s.dim):
         _add_noise(s, axis, axis, motion * cube_s, motion * square_s, motion * dt)
-    for anchor in range(s.count):
-        offset = where.offset + anchor
-        walk = settings.walk * s.anchors[anchor].walk_scale
-        _add_noise(s, offset, offset, white_m2 + walk * cube_s, walk * square_s, walk * dt)
+    if not has_order(s):
+        for anchor in range(s.count):
+            offset = where.offset + anchor
+            walk = settings.walk * s.anchors[anchor].walk_scale
+            _add_noise(s, offset, offset, white_m2 + walk * cube_s, walk * square_s, walk * dt)
     walk = settings.walk * status.walk_scale
     for one in range(where.offset, where.velocity):
         for other in range(where.offset, one + 1):
             _add_noise(s, one, other, white_m2 + walk * cube_s, walk * square_s, walk * dt)
     status.epoch_ticks = rx_ticks
+
+
+def has_order(s: State) -> bool:
+    """Whether relays are processed before the reception of the packet that brings them, the oldest first."""
+    return PHASE_STATES > 0 and s.status.is_in_order
+
+
+def add_clock_noise(s: State, anchor: int, until_ticks: Ticks) -> None:
+    """Add the noise of an anchor's own clock up to a tag time, as it acts on the state at the newest packet.
+
+    Before the next packet nothing is known of this clock. So its noise is added when that comes, from relay to relay:
+    each tells of the clock at the time of an earlier packet, and after it only the noise of the rest is unknown.
+    """
+    a, settings, offset = s.anchors[anchor], s.settings, s.layout.offset + anchor
+    dt, lead = (until_ticks - a.noise_ticks) * TICK_S, (s.status.epoch_ticks - until_ticks) * TICK_S
+    if dt > 0.0:
+        walk = settings.walk * a.walk_scale
+        of_both = walk * dt * (dt / 2.0 + lead)
+        of_values = settings.white * dt + walk * dt * (dt * dt / 3.0 + lead * (dt + lead))
+        _add_noise(s, offset, offset, of_values, of_both, walk * dt)
+        a.noise_ticks = until_ticks
 
 
 def speed_squared(s: State) -> float:

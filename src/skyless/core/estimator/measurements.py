@@ -18,6 +18,7 @@ from skyless.core.estimator.kalman import (
     compute_fault_input,
     compute_ph,
     finish_updates,
+    has_order,
     open_direction,
     relax_range_error,
     reset_state,
@@ -311,6 +312,7 @@ def first_reception(s: State, anchor: int, rx_ticks: Ticks, tx_ticks: Ticks, var
     s.x[offset] = rest_m - range_m - curvature_m - h_dot_x(s, direction_terms(s))
     a.has_tx_noise = True
     a.range_m = range_m
+    a.noise_ticks = s.status.epoch_ticks
 
 
 def open_state(s: State, state: int, own: int, variance: float) -> None:
@@ -365,7 +367,16 @@ def relay_variance(s: State, listener: int, sender: int, age_s: float) -> float:
     """Variance of a relay: its RX stamp and the noise of two oscillators since."""
     settings = s.settings
     walk = settings.walk * max(s.anchors[listener].walk_scale, s.anchors[sender].walk_scale)
+    if has_order(s):
+        return settings.rx_variance_m2 + _noise_since(s, listener, age_s) + _noise_since(s, sender, age_s)
     return settings.rx_variance_m2 + 2.0 * age_s * (settings.white + walk * age_s * age_s / 3.0)
+
+
+def _noise_since(s: State, anchor: int, age_s: float) -> float:
+    """Variance of an anchor's clock by its noise that P contains of this time."""
+    since_s = max(age_s - (s.status.epoch_ticks - s.anchors[anchor].noise_ticks) * TICK_S, 0.0)
+    walk = s.settings.walk * s.anchors[anchor].walk_scale
+    return since_s * (s.settings.white + walk * since_s * since_s / 3.0)
 
 
 def relay_age_s(s: State, listener: int, sender: int, packet_rx_ticks: Ticks) -> float:

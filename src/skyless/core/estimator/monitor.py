@@ -270,8 +270,15 @@ def adapt_clock_noise(s: State, anchor: int, normalised: float) -> None:
     """Adapt the process noise of an anchor's clock to a relay's innovation."""
     a = s.anchors[anchor]
     a.relay_mean += s.tuning.mean_gain * (normalised - a.relay_mean)
-    least = _least_scale(s, s.status.anchors_walk)
-    a.walk_scale = _adapted(s, a.walk_scale, _is_off_zero(s, a.relay_mean), least, s.tuning.max_walk_scale)
+    least, is_off = _least_scale(s, s.status.anchors_walk), _is_off_zero(s, a.relay_mean)
+    if PHASE_STATES > 0 and a.mesh.is_known:  # rather than its clock wander, its cycles are wrong
+        if _is_off_zero(s, a.relay_mean * s.tuning.suspect / s.settings.gate):
+            offset = s.layout.offset + anchor
+            s.P[at(offset, offset)] += square(s.tuning.slip_std_m)
+            a.mesh.is_known = False
+            a.relay_mean = 0.0
+        is_off = False
+    a.walk_scale = _adapted(s, a.walk_scale, is_off, least, s.tuning.max_walk_scale)
 
 
 def _least_scale(s: State, walk: float) -> float:

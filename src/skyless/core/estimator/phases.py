@@ -1,7 +1,7 @@
 """Carrier phase: 20 times as precise as a stamp, but known only modulo a wavelength.
 
     R − X  =  |p − a| + b + ambiguity + noise                 (mod λ)      (the tag receives an anchor)
-    S − X  =  |aᵢ − aⱼ| + bⱼ − bᵢ + ambiguity + noise         (mod λ)      (anchor i receives its partner j)
+    S − X  =  |aᵢ − aⱼ| + bⱼ − bᵢ + γᵢ − γⱼ + constant + noise (mod λ)     (anchor i receives anchor j)
 
 X is the sender's counter when the frame leaves: the carrier starts at a phase given by the counter, so the noise of the
 TX stamp is not in it. An ambiguity contains what is constant while both radios keep their supply, and the effect of
@@ -15,7 +15,7 @@ stamp that was used. If it is not predicted to a tenth of a wavelength, it is ta
 
 from typing import Final
 
-from skyless.core.estimator.hypotheses import give_up_hypotheses, scatter, settle_hypotheses, take_cycles
+from skyless.core.estimator.hypotheses import give_up_hypotheses, settle_hypotheses, spread_of_h, take_cycles
 from skyless.core.estimator.kalman import (
     are_phases_reliable,
     compute_fault_input,
@@ -35,7 +35,7 @@ from skyless.core.estimator.measurements import (
     relay_variance,
 )
 from skyless.core.estimator.monitor import learn_least_walk
-from skyless.core.estimator.state import Ambiguity, State, at, set_covariance, use_phases
+from skyless.core.estimator.state import Ambiguity, State, at, forget_pair_phase, set_covariance, use_phases
 from skyless.core.native.arithmetic import exp, floor, log, sqrt, square
 from skyless.core.native.records import Reals, Ticks
 from skyless.core.ticks import TICK_M, TICK_S
@@ -66,7 +66,7 @@ def own_phase(s: State, anchor: int, phase_cycles: float) -> None:
     innovation, variance = _innovation_m(s, cycles, expected_m), status.phase_variance_m2
     predicted = max(compute_ph(s), 0.0)  # rounding may make it negative
     is_informative = a.own.is_known and square(s.settings.gate) * (predicted + variance) < square(_wavelength_m(s))
-    is_used = _use_phase(s, ambiguity, a.own, innovation, predicted, variance, True)
+    is_used = _use_phase(s, ambiguity, a.own, innovation, predicted, variance)
     if is_informative:
         _count_wild(s, predicted + variance)
     if is_used and predicted <= _certain_m2(s) and s.hypotheses.count == 0:
@@ -74,27 +74,68 @@ def own_phase(s: State, anchor: int, phase_cycles: float) -> None:
 
 
 def relay_phase(s: State, listener: int, sender: int, packet_rx_ticks: Ticks, phase_cycles: float) -> None:
-    """Process the phase of an anchor's reception of its partner, whose stamp was used; ignore other senders.
+    """Process the phase of an anchor's reception of another one, whose stamp was used.
 
-    The partner is the relayed anchor of lowest identifier, so that all clocks are tied to one.
+    The clock that phases show of an anchor differs from that of its stamps by γ, which its first pair determines. All
+    other pairs have constants, which are estimated outside the filter.
     """
-    i, j, settings, where = s.anchors[listener], s.anchors[sender], s.settings, s.layout
+    i, j, link, mesh = s.anchors[listener], s.anchors[sender], s.links[listener][sender], s.layout.mesh
     finish_updates(s)
-    is_silent = (s.status.epoch_ticks - i.mesh.ticks) * TICK_S > settings.relay_age_s
-    if not i.mesh.is_known or j.identifier < i.partner or is_silent:
-        i.mesh.is_known = i.mesh.is_known and i.partner == j.identifier and not is_silent
-        i.partner = j.identifier
-    if i.partner != j.identifier or not j.has_rate:
+    if not j.has_rate or not _agree(s) or not _has_mesh(s, sender):
         return
     age_s = relay_age_s(s, listener, sender, packet_rx_ticks)
     relay_terms(s, listener, sender, age_s, False)
     expected_m = find_distance_m(s, listener, sender) + h_dot_x(s, 0)
-    add_term(s, where.mesh + listener, 1.0)
-    cycles = -phase_cycles - _whole_cycles(s, j.offset_ticks - i.offset_ticks)
-    variance = square(s.tuning.phase_mesh_std_m) + relay_variance(s, listener, sender, age_s) - settings.rx_variance_m2
-    innovation = _innovation_m(s, cycles, expected_m + s.x[where.mesh + listener])
-    is_slow = s.status.recent_square < 4.0 * square(s.tuning.phase_walking_mps)  # a fast tag's own need all hypotheses
-    _use_phase(s, where.mesh + listener, i.mesh, innovation, max(compute_ph(s), 0.0), variance, is_slow)
+    add_term(s, mesh + sender, -1.0)
+    add_term(s, mesh + listener, 1.0)
+    expected_m += s.x[mesh + listener] - s.x[mesh + sender] + link.phase_m
+    innovation = _innovation_m(s, -phase_cycles - _whole_cycles(s, j.offset_ticks - i.offset_ticks), expected_m)
+    predicted, aged_m2 = max(compute_ph(s), 0.0), relay_variance(s, listener, sender, age_s) - s.settings.rx_variance_m2
+    variance = square(s.tuning.phase_mesh_std_m) + aged_m2
+    if not i.mesh.is_known:
+        if link.has_phase or not _has_pairs(s, listener):
+            link.has_phase = True
+            _open(s, mesh + listener, i.mesh, innovation, variance + link.phase_variance_m2)
+        return
+    likely_m, spread_m2 = spread_of_h(s, _wavelength_m(s))
+    shown_m2, known_m2 = predicted + spread_m2 + variance, square(s.tuning.pair_share * _wavelength_m(s))
+    if not link.has_phase or link.phase_variance_m2 > known_m2:
+        link.has_phase, link.phases_refused = True, 0
+        link.phase_m, link.phase_variance_m2 = link.phase_m + innovation - likely_m, shown_m2
+        return
+    expected_m2 = predicted + variance + link.phase_variance_m2
+    limit_m = sqrt(_limit_m2(s, predicted, expected_m2))
+    if not take_cycles(s, innovation, expected_m2, limit_m, _wavelength_m(s)):
+        s.status.phases_refused += 1
+        link.phases_refused += 1
+        if link.phases_refused >= int(s.tuning.phases_in_row):
+            forget_pair_phase(link)
+        return
+    s.status.phases_used += 1
+    link.phases_refused = 0
+    if shown_m2 < known_m2:
+        share, shown_m = link.phase_variance_m2 / (shown_m2 + link.phase_variance_m2), innovation - likely_m
+        link.phase_m += share * (shown_m - floor(shown_m / _wavelength_m(s) + 0.5) * _wavelength_m(s))
+        link.phase_variance_m2 -= share * link.phase_variance_m2
+
+
+def _has_mesh(s: State, anchor: int) -> bool:
+    """Whether the clock that phases show of an anchor is known; of the first one it is by definition that of stamps."""
+    is_first = True
+    for one in range(s.count):
+        is_first = is_first and not s.anchors[one].mesh.is_known
+    if is_first:
+        reset_state(s, s.layout.mesh + anchor, 0.0)
+        s.anchors[anchor].mesh.is_known = True
+    return s.anchors[anchor].mesh.is_known
+
+
+def _has_pairs(s: State, anchor: int) -> bool:
+    """Whether the constant of any pair of an anchor has been measured: its clock must then fit that."""
+    has_pairs = False
+    for other in range(s.count):
+        has_pairs = has_pairs or s.links[anchor][other].has_phase or s.links[other][anchor].has_phase
+    return has_pairs
 
 
 def _whole_cycles(s: State, ticks: Ticks) -> float:
@@ -117,44 +158,43 @@ def _innovation_m(s: State, cycles: float, expected_m: float) -> float:
     return (off - floor(off + 0.5)) * _wavelength_m(s)
 
 
-def _use_phase(
-    s: State, state: int, one: Ambiguity, innovation: float, predicted: float, variance: float, may_be_several: bool
-) -> bool:
+def _use_phase(s: State, state: int, own: Ambiguity, innovation: float, predicted: float, variance: float) -> bool:
     """Process the phase in ``h``, whose last term is its ambiguity, the state of that index. Returns False if unused.
 
-    ``predicted``: hᵀ·P·h, as ``compute_ph`` found it; ``may_be_several``: whether it may be taken at several cycles.
+    ``predicted``: hᵀ·P·h, as ``compute_ph`` found it.
     """
     status = s.status
-    one.ticks = status.epoch_ticks
-    is_certain, within_m2 = predicted <= _certain_m2(s), square(s.settings.gate) * (predicted + variance)
-    if is_certain:
-        within_m2 = _limit_m2(s, predicted + variance)
-    if not one.is_known or not (is_certain or (may_be_several and _are_few(s, within_m2))):
+    own.ticks = status.epoch_ticks
+    within_m2 = _limit_m2(s, predicted, predicted + variance)
+    if not own.is_known or not (predicted <= _certain_m2(s) or _are_few(s, within_m2)):
         s.hypotheses.fit = 0.0
         for cycle in range(-1, 2):
             off_m = innovation + cycle * _wavelength_m(s)
             s.hypotheses.fit += exp(-0.5 * square(off_m) / (predicted + variance))
-        _open(s, state, one, innovation, variance)
+        _open(s, state, own, innovation, variance)
         return False
     if not take_cycles(s, innovation, predicted + variance, sqrt(within_m2), _wavelength_m(s)):
         status.phases_refused += 1
-        one.refused_in_row += 1
-        if one.refused_in_row >= int(s.tuning.phases_in_row):
-            _open(s, state, one, innovation, variance)
+        own.refused_in_row += 1
+        if own.refused_in_row >= int(s.tuning.phases_in_row):
+            _open(s, state, own, innovation, variance)
         return False
-    one.refused_in_row = 0
+    own.refused_in_row = 0
     status.phases_used += 1
     return True
 
 
 def _are_few(s: State, within_m2: float) -> bool:
     """Whether the cycles within a distance are few enough, and phases so reliable, that hypotheses are of use."""
-    return 4.0 * within_m2 < square(s.tuning.most_cycles * _wavelength_m(s)) and are_phases_reliable(s)
+    has_settled = s.status.walk_scale < s.tuning.phases_walk_scale
+    return has_settled and 4.0 * within_m2 < square(s.tuning.most_cycles * _wavelength_m(s)) and are_phases_reliable(s)
 
 
-def _limit_m2(s: State, variance: float) -> float:
-    """Squared innovation beyond which a phase is more likely random than noisy, or may be off by a cycle."""
+def _limit_m2(s: State, predicted: float, variance: float) -> float:
+    """Squared innovation beyond which a phase is not used: if its cycle is certain, where it is more likely random."""
     gate_squared = square(s.settings.gate)
+    if predicted > _certain_m2(s):
+        return gate_squared * variance
     odds = min(s.status.wild_share, 0.5) * sqrt(_TWO_PI * variance) / _wavelength_m(s)
     if odds > 1e-6:
         gate_squared = min(gate_squared, -2.0 * log(odds))
@@ -180,23 +220,26 @@ def _learn_noise(s: State, shown_m2: float) -> None:
 
 
 def _may_count(s: State) -> bool:
-    """Whether the tag's phases may be used: neither just after the start nor while stamps contradict the state."""
+    """Whether the tag's phases may be used: neither soon after the start nor while stamps contradict the state.
+
+    If they contradict hypotheses, all of these may be wrong, and P is smaller than the position's error.
+    """
     status, tuning = s.status, s.tuning
     settle_hypotheses(s)
     if not are_phases_reliable(s):
         give_up_hypotheses(s)
-    if status.mean_nis > tuning.wrong_nis or _stay_apart(s):
+    are_wrong = s.hypotheses.count > 0 and status.mean_nis > tuning.phases_nis
+    if are_wrong:
+        for axis in range(s.dim):
+            s.P[at(axis, axis)] += square(tuning.slip_std_m)
+    if are_wrong or not _agree(s):
         close_phases(s)
-    is_settled = (status.epoch_ticks - status.start_ticks) * TICK_S >= tuning.new_start_s
-    return is_settled and status.mean_nis <= tuning.wrong_nis
+    return _agree(s) and (status.epoch_ticks - status.start_ticks) * TICK_S >= tuning.phases_start_s
 
 
-def _stay_apart(s: State) -> bool:
-    """Whether the positions of hypotheses differ by more than stamps err."""
-    apart_m2 = 0.0
-    for axis in range(s.dim):
-        apart_m2 += scatter(s, axis, axis)
-    return apart_m2 > square(s.tuning.apart_m)
+def _agree(s: State) -> bool:
+    """Whether stamps do not contradict the state."""
+    return s.status.mean_nis <= s.tuning.wrong_nis
 
 
 def close_phases(s: State) -> None:

@@ -5,7 +5,14 @@ from typing import Annotated, Final
 from skyless.core.air.frame import HEARD_BYTES, PHASE_STEPS, SHORT_BITS, two_bytes, unsigned
 from skyless.core.estimator.faults import fade_faults, open_faults
 from skyless.core.estimator.hypotheses import scatter, settle_hypotheses
-from skyless.core.estimator.kalman import finish_updates, follows_cycles, is_stationary, predict
+from skyless.core.estimator.kalman import (
+    add_clock_noise,
+    finish_updates,
+    follows_cycles,
+    has_order,
+    is_stationary,
+    predict,
+)
 from skyless.core.estimator.levels import fit_plane, integrity_state, largest_test, protect
 from skyless.core.estimator.measurements import (
     CLOCK_JUMPED,
@@ -220,6 +227,9 @@ def _process_of(s: State, anchor: int, packet: Packet, relays: Relays) -> int:
         return outcome
     status.stale_in_row = 0
     _advance_to(s, rx_ticks)
+    if has_order(s):
+        _process_relays(s, packet, relays)
+        add_clock_noise(s, anchor, rx_ticks)
     if outcome == JOINED:
         first_reception(s, anchor, rx_ticks, tx_ticks, packet.variance_factor)
     else:
@@ -228,19 +238,15 @@ def _process_of(s: State, anchor: int, packet: Packet, relays: Relays) -> int:
             return RESTARTED_CLOCK
         outcome = ACCEPTED if result == USED else REJECTED
         if PHASE_STATES > 0 and packet.has_phase and s.settings.carrier_cycles > 0:
-            if result == USED:
-                own_phase(s, anchor, packet.phase_cycles)
-            elif a.outliers_in_row > 1:
-                close_phases(s)
+            _process_phase(s, anchor, packet.phase_cycles, result == USED)
     is_known = a.packets > 0
     status.packets += 1
     _keep_packet(s, anchor, packet)
     if is_known:
         status.relays_lately_accepted *= 1.0 - s.tuning.mean_gain
         status.relays_lately_rejected *= 1.0 - s.tuning.mean_gain
-        for one in range(relays.count):
-            _process_relay(s, relays.rows[one])
-        finish_updates(s)
+        if not has_order(s):
+            _process_relays(s, packet, relays)
         if packet.report_variance_m2 > 0.0 and packet.master >= 0:
             master = find_anchor(s, packet.master)
             if master >= 0 and master != anchor:
@@ -299,7 +305,22 @@ def _keep_packet(s: State, anchor: int, packet: Packet) -> None:
     kept.rx_ticks = packet.rx_ticks
 
 
-def _process_relay(s: State, relayed: Relay) -> None:
+def _process_phase(s: State, anchor: int, phase_cycles: float, is_used: bool) -> None:
+    """Process the phase of a reception, if the stamp was used."""
+    if is_used:
+        own_phase(s, anchor, phase_cycles)
+    elif s.anchors[anchor].outliers_in_row > 1:
+        close_phases(s)
+
+
+def _process_relays(s: State, packet: Packet, relays: Relays) -> None:
+    """Process the relays of a packet: as listed, the newest first, or in order."""
+    for one in range(relays.count):
+        _process_relay(s, packet, relays.rows[relays.count - 1 - one if has_order(s) else one])
+    finish_updates(s)
+
+
+def _process_relay(s: State, packet: Packet, relayed: Relay) -> None:
     """Process a relay once, if the tag has received that packet."""
     listener, sender = find_anchor(s, relayed.listener), find_anchor(s, relayed.anchor)
     if listener < 0 or sender < 0 or sender == listener or not s.anchors[listener].has_rate:
@@ -308,8 +329,10 @@ def _process_relay(s: State, relayed: Relay) -> None:
     is_young = (s.status.epoch_ticks - kept.rx_ticks) * TICK_S < s.settings.relay_age_s
     if kept.sequence == relayed.sequence and kept.tx_ticks > link.tx_ticks and is_young:
         link.tx_ticks = kept.tx_ticks
-        i = s.anchors[listener]
-        rx_ticks = relay_rx_ticks(relayed, i.tx_ticks, i.rx_ticks - kept.rx_ticks)
+        rx_ticks = relay_rx_ticks(relayed, packet.tx_ticks, packet.rx_ticks - kept.rx_ticks)
+        if has_order(s):
+            add_clock_noise(s, sender, kept.rx_ticks)
+            add_clock_noise(s, listener, kept.rx_ticks)
         is_used = relay(s, listener, sender, kept.tx_ticks, kept.rx_ticks, rx_ticks)
         if PHASE_STATES > 0 and is_used and relayed.has_phase and s.status.has_phases:
             relay_phase(s, listener, sender, kept.rx_ticks, relayed.phase_cycles)

@@ -286,7 +286,9 @@ class Tuning(Record):
     """Initial variance of a barometer's zero [m²]."""
 
     # Phases of the carrier
-    phase_start_std_m: float = 0.002
+    phases_start_s: float = 2.0
+    """Time from a start until the tag's phases are used: by then constants of pairs of anchors are known [s]."""
+    phase_start_std_m: float = 0.003
     """Standard deviation of a phase until innovations show another [m] …"""
     phase_max_std_m: float = 0.006
     """… and its upper limit, unless the settings exceed it [m]."""
@@ -300,7 +302,17 @@ class Tuning(Record):
     """Largest standard deviation of a prediction that determines the cycle, as a fraction of a wavelength."""
     phase_step_m: float = 0.02
     """Length of the steps by which reflections change phases [m]."""
-    most_cycles: float = 3.0
+    pair_share: float = 0.2
+    """Largest standard deviation of a pair's constant at which its phases are used, and of one of these at which it
+    changes the constant, as a fraction of a wavelength."""
+    phases_nis: float = 1.6
+    """Mean NIS beyond which all hypotheses on cycles are given up …"""
+    slip_std_m: float = 0.05
+    """… and what is then added to the standard deviation of the position, or to that of an anchor's clock whose relays'
+    stamps contradict their phases: about a wavelength [m]."""
+    phases_walk_scale: float = 8.0
+    """Largest factor on the random walk of the tag's clock at which phases are taken at several cycles."""
+    most_cycles: float = 4.0
     """Number of cycles within the gate beyond which hypotheses on them are of no use."""
     start_wild: float = 0.009
     """Share of wild phases at a start: hypotheses are possible, but not for long if one looks wild."""
@@ -310,8 +322,6 @@ class Tuning(Record):
     """Share beyond which hypotheses on cycles are misleading."""
     unlikely_log_odds: float = 14.0
     """Logarithm of the odds against a hypothesis beyond which it is dropped."""
-    apart_m: float = 0.03
-    """Standard deviation of the positions of hypotheses beyond which they are given up [m]."""
     phase_walking_mps: float = 0.7
     """The same as ``walking_mps`` while phases may be taken at several cycles [m/s] …"""
     speed_memory_s: float = 1.0

@@ -7,7 +7,7 @@ The state vector, all clocks against the tag's own counter, in metres and m/s:
     rates       velocity (dim), then the rate of each offset
     tx noises   of each anchor's newest TX stamp, common to all who received it
     ambiguities for each anchor what its carrier phase shows beyond range and offset, once phases are in use
-    meshes      for each anchor the ambiguity of its own receptions of its partner, another anchor
+    meshes      for each anchor the difference between its clock as phases of relays show it and that of its stamps
     changes     for each anchor the part of the range error that changes as the tag moves
     constants   the part that stays
     slope       growth of ranges with distance
@@ -158,7 +158,7 @@ class Anchor(Record):
     own: Ambiguity
     """Ambiguity of the tag's receptions of it."""
     mesh: Ambiguity
-    """Ambiguity of its receptions of its partner."""
+    """Difference between its clock as phases of relays show it and that of its stamps."""
     rate_offset_ticks: Ticks
     """Its offset when rates of clocks were compared …"""
     rate_offset_m: float
@@ -167,8 +167,8 @@ class Anchor(Record):
     """Its mean rate from the comparison before."""
     rates: int
     """Consecutive comparisons that it took part in."""
-    partner: int
-    """Identifier of the partner, −1 if none."""
+    noise_ticks: Ticks
+    """Tag time up to which P contains the noise of its own clock, if relays are processed in order."""
     phase_way_m: float
     """``Status.way_m`` at its newest phase."""
 
@@ -219,6 +219,14 @@ class Link(Record):
     outliers_in_row: int
     contradicts: bool
     """Whether its range contradicts the survey."""
+    has_phase: bool
+    """Whether the constant of phases in this direction has been measured …"""
+    phase_m: float
+    """… its value modulo the wavelength …"""
+    phase_variance_m2: float
+    """… and its variance."""
+    phases_refused: int
+    """Consecutive phases beyond the gate."""
 
 
 @record
@@ -360,6 +368,8 @@ class Status(Record):
     """Normal of that plane."""
     has_phases: bool
     """Whether phases are in use, so that there are ambiguities."""
+    is_in_order: bool
+    """Whether relays are processed before the reception of the packet that brings them, the oldest first."""
     rate_ticks: Ticks
     """Tag time at which rates of clocks were compared."""
     rate_changes: Count
@@ -658,7 +668,6 @@ def add_anchor(s: State, identifier: int, position_m: Reals, std_m: float, is_op
     for axis in range(AXES):
         a.position_m[axis] = position_m[axis]
     a.tx_ticks = a.rx_ticks = NEVER
-    a.partner = -1
     a.walk_scale = 1.0
     a.change_variance_m2 = square(settings.place_std_m)
     s.lasting_covariance[anchor][anchor] = square(s.status.fault_std_m[LASTING])
@@ -688,8 +697,10 @@ def use_phases(s: State) -> None:
     if not s.status.has_phases:
         for _ in range(2 * s.count):
             _insert_state(s, s.layout.change)
-        s.status.has_phases = True
+        s.status.has_phases = s.status.is_in_order = True
         set_layout(s)
+        for anchor in range(s.count):
+            s.anchors[anchor].noise_ticks = s.status.epoch_ticks
 
 
 def use_motion(s: State) -> None:
@@ -724,6 +735,13 @@ def _clear_link(link: Link, variance_m2: float) -> None:
     link.outliers_in_row = 0
     link.relays = 0
     link.contradicts = False
+    forget_pair_phase(link)
+
+
+def forget_pair_phase(link: Link) -> None:
+    """Forget the constant of phases in a direction of a pair."""
+    link.has_phase, link.phases_refused = False, 0
+    link.phase_m = link.phase_variance_m2 = 0.0
 
 
 def remove_anchor(s: State, anchor: int) -> None:

@@ -77,6 +77,7 @@ static inline int64_t floor_div_64(int64_t x, int64_t y) { return x / y - (x % y
 static inline int32_t floor_mod_32(int32_t x, int32_t y) { return x - y * floor_div_32(x, y); }
 static inline int64_t floor_mod_64(int64_t x, int64_t y) { return x - y * floor_div_64(x, y); }
 
+typedef struct { real item_0; real item_1; } spread_of_h_results;
 typedef struct { real item_0; real item_1; real item_2; } range_error_decay_results;
 
 INTERNAL real exp_(real x);
@@ -162,6 +163,7 @@ INTERNAL void use_phases(State *s);
 INTERNAL void use_motion(State *s);
 INTERNAL void expect_motion(State *s);
 INTERNAL void clear_link(Link *link, real variance_m2);
+INTERNAL void forget_pair_phase(Link *link);
 INTERNAL void remove_anchor(State *s, int32_t anchor);
 INTERNAL void insert_state(State *s, int32_t index_);
 INTERNAL void remove_state(State *s, int32_t index_);
@@ -174,6 +176,8 @@ INTERNAL void learn_lasting(State *s, real *m, real weight, real shown);
 INTERNAL void forget_lasting(State *s, int32_t anchor);
 INTERNAL void weigh_zero(State *s, int32_t anchor, real weight);
 INTERNAL void predict(State *s, int64_t rx_ticks);
+INTERNAL bool has_order(State *s);
+INTERNAL void add_clock_noise(State *s, int32_t anchor, int64_t until_ticks);
 INTERNAL real speed_squared(State *s);
 INTERNAL real motion_noise(State *s);
 INTERNAL bool has_phase(State *s, int32_t anchor);
@@ -231,6 +235,7 @@ INTERNAL void replace(State *s, real inverse);
 INTERNAL void settle_hypotheses(State *s);
 INTERNAL void set_count(State *s, int32_t count);
 INTERNAL real scatter(State *s, int32_t state, int32_t other);
+INTERNAL spread_of_h_results spread_of_h(State *s, real cycle_m);
 INTERNAL void give_up_hypotheses(State *s);
 INTERNAL bool is_warm(State *s);
 INTERNAL void note_outlier(State *s, int32_t anchor, real innovation, real innovation_variance);
@@ -280,6 +285,7 @@ INTERNAL void open_state(State *s, int32_t state, int32_t own, real variance);
 INTERNAL void find_rate(State *s, int32_t anchor, real innovation, real innovation_variance, real elapsed_s);
 INTERNAL void relay_terms(State *s, int32_t listener, int32_t sender, real age_s, bool has_tx_noise);
 INTERNAL real relay_variance(State *s, int32_t listener, int32_t sender, real age_s);
+INTERNAL real noise_since(State *s, int32_t anchor, real age_s);
 INTERNAL real relay_age_s(State *s, int32_t listener, int32_t sender, int64_t packet_rx_ticks);
 INTERNAL bool relay(State *s, int32_t listener, int32_t sender, int64_t tx_ticks, int64_t packet_rx_ticks, int64_t
         rx_ticks);
@@ -323,18 +329,19 @@ INTERNAL void turn_states(State *s, int32_t one, int32_t other, real cos, real s
 INTERNAL void measure_speed(State *s, real dt);
 INTERNAL void own_phase(State *s, int32_t anchor, real phase_cycles);
 INTERNAL void relay_phase(State *s, int32_t listener, int32_t sender, int64_t packet_rx_ticks, real phase_cycles);
+INTERNAL bool has_mesh(State *s, int32_t anchor);
+INTERNAL bool has_pairs(State *s, int32_t anchor);
 INTERNAL real whole_cycles(State *s, int64_t ticks);
 INTERNAL real wavelength_m(State *s);
 INTERNAL real certain_m2(State *s);
 INTERNAL real innovation_m(State *s, real cycles, real expected_m);
-INTERNAL bool use_phase(State *s, int32_t state, Ambiguity *one, real innovation, real predicted, real variance, bool
-        may_be_several);
+INTERNAL bool use_phase(State *s, int32_t state, Ambiguity *own, real innovation, real predicted, real variance);
 INTERNAL bool are_few(State *s, real within_m2);
-INTERNAL real limit_m2(State *s, real variance);
+INTERNAL real limit_m2(State *s, real predicted, real variance);
 INTERNAL void count_wild(State *s, real variance);
 INTERNAL void learn_noise(State *s, real shown_m2);
 INTERNAL bool may_count(State *s);
-INTERNAL bool stay_apart(State *s);
+INTERNAL bool agree(State *s);
 INTERNAL void close_phases(State *s);
 INTERNAL void measure_way(State *s);
 INTERNAL void follow_line(State *s);
@@ -356,7 +363,9 @@ INTERNAL void advance_to(State *s, int64_t rx_ticks);
 INTERNAL int32_t admit(State *s, int32_t anchor, int64_t rx_ticks, int64_t tx_ticks);
 INTERNAL bool is_impossible(State *s, int32_t anchor, int64_t rx_ticks, int64_t tx_ticks);
 INTERNAL void keep_packet(State *s, int32_t anchor, Packet *packet);
-INTERNAL void process_relay(State *s, Relay *relayed);
+INTERNAL void process_phase(State *s, int32_t anchor, real phase_cycles, bool is_used);
+INTERNAL void process_relays(State *s, Packet *packet, Relays *relays);
+INTERNAL void process_relay(State *s, Packet *packet, Relay *relayed);
 INTERNAL void check_motion_and_faults(State *s, real elapsed_s);
 INTERNAL void fill_fix(State *s);
 INTERNAL void note_difference(State *s, int32_t anchor, int64_t rx_ticks);
@@ -1586,7 +1595,7 @@ INTERNAL real vertical_limit(real risk) {
  *     rates       velocity (dim), then the rate of each offset
  *     tx noises   of each anchor's newest TX stamp, common to all who received it
  *     ambiguities for each anchor what its carrier phase shows beyond range and offset, once phases are in use
- *     meshes      for each anchor the ambiguity of its own receptions of its partner, another anchor
+ *     meshes      for each anchor the difference between its clock as phases of relays show it and that of its stamps
  *     changes     for each anchor the part of the range error that changes as the tag moves
  *     constants   the part that stays
  *     slope       growth of ranges with distance
@@ -1808,7 +1817,6 @@ SKYLESS_EXPORT int32_t skyless_add_anchor(State *s, int32_t identifier, real *po
     }
     a->rx_ticks = NEVER;
     a->tx_ticks = NEVER;
-    a->partner = -1;
     a->walk_scale = REAL(1.0);
     a->change_variance_m2 = square(settings->place_std_m);
     s->lasting_covariance[anchor][anchor] = square(s->status.fault_std_m[LASTING]);
@@ -1847,8 +1855,12 @@ INTERNAL void use_phases(State *s) {
         for (int32_t time_1 = 0, time_1_end = 2 * s->count; time_1 < time_1_end; time_1++) {
             insert_state(s, s->layout.change);
         }
+        s->status.is_in_order = true;
         s->status.has_phases = true;
         set_layout(s);
+        for (int32_t anchor = 0, anchor_end = s->count; anchor < anchor_end; anchor++) {
+            s->anchors[anchor].noise_ticks = s->status.epoch_ticks;
+        }
     }
 }
 
@@ -1890,6 +1902,15 @@ INTERNAL void clear_link(Link *link, real variance_m2) {
     link->outliers_in_row = 0;
     link->relays = 0;
     link->contradicts = false;
+    forget_pair_phase(link);
+}
+
+/* Forget the constant of phases in a direction of a pair. */
+INTERNAL void forget_pair_phase(Link *link) {
+    link->has_phase = false;
+    link->phases_refused = 0;
+    link->phase_variance_m2 = REAL(0.0);
+    link->phase_m = REAL(0.0);
 }
 
 /* Remove an anchor from the state. */
@@ -2147,10 +2168,12 @@ INTERNAL void predict(State *s, int64_t rx_ticks) {
     for (int32_t axis = 0, axis_end = s->dim; axis < axis_end; axis++) {
         add_noise(s, axis, axis, motion * cube_s, motion * square_s, motion * dt);
     }
-    for (int32_t anchor = 0, anchor_end = s->count; anchor < anchor_end; anchor++) {
-        int32_t offset = where->offset + anchor;
-        walk = settings->walk * s->anchors[anchor].walk_scale;
-        add_noise(s, offset, offset, white_m2 + walk * cube_s, walk * square_s, walk * dt);
+    if (!has_order(s)) {
+        for (int32_t anchor = 0, anchor_end = s->count; anchor < anchor_end; anchor++) {
+            int32_t offset = where->offset + anchor;
+            walk = settings->walk * s->anchors[anchor].walk_scale;
+            add_noise(s, offset, offset, white_m2 + walk * cube_s, walk * square_s, walk * dt);
+        }
     }
     walk = settings->walk * status->walk_scale;
     for (int32_t one = where->offset, one_end = where->velocity; one < one_end; one++) {
@@ -2159,6 +2182,30 @@ INTERNAL void predict(State *s, int64_t rx_ticks) {
         }
     }
     status->epoch_ticks = rx_ticks;
+}
+
+/* Whether relays are processed before the reception of the packet that brings them, the oldest first. */
+INTERNAL bool has_order(State *s) {
+    return PHASE_STATES > 0 && s->status.is_in_order;
+}
+
+/* Add the noise of an anchor's own clock up to a tag time, as it acts on the state at the newest packet.
+ *
+ * Before the next packet nothing is known of this clock. So its noise is added when that comes, from relay to relay:
+ * each tells of the clock at the time of an earlier packet, and after it only the noise of the rest is unknown. */
+INTERNAL void add_clock_noise(State *s, int32_t anchor, int64_t until_ticks) {
+    Anchor *a = &s->anchors[anchor];
+    EstimatorSettings *settings = &s->settings;
+    int32_t offset = s->layout.offset + anchor;
+    real dt = (real)(until_ticks - a->noise_ticks) * TICK_S;
+    real lead = (real)(s->status.epoch_ticks - until_ticks) * TICK_S;
+    if (dt > REAL(0.0)) {
+        real walk = settings->walk * a->walk_scale;
+        real of_both = walk * dt * (dt / REAL(2.0) + lead);
+        real of_values = settings->white * dt + walk * dt * (dt * dt / REAL(3.0) + lead * (dt + lead));
+        add_noise(s, offset, offset, of_values, of_both, walk * dt);
+        a->noise_ticks = until_ticks;
+    }
 }
 
 /* Square of the tag's speed. */
@@ -3157,6 +3204,31 @@ INTERNAL real scatter(State *s, int32_t state, int32_t other) {
     return total;
 }
 
+/* Deviation of the measurement in ``h`` by the most likely hypothesis, and the others' variance modulo a cycle. */
+INTERNAL spread_of_h_results spread_of_h(State *s, real cycle_m) {
+    Hypotheses *hypotheses = &s->hypotheses;
+    int32_t likely = 0;
+    int32_t first = FAULT_KINDS * s->count;
+    real total = REAL(0.0);
+    if (hypotheses->count == 0) {
+        return (spread_of_h_results){REAL(0.0), REAL(0.0)};
+    }
+    for (int32_t one = 0, one_end = hypotheses->count; one < one_end; one++) {
+        if (hypotheses->weight[one] > hypotheses->weight[likely]) {
+            likely = one;
+        }
+        hypotheses->old[one] = REAL(0.0);
+        for (int32_t term = 0, term_end = s->terms; term < term_end; term++) {
+            hypotheses->old[one] += s->h[term] * s->V[s->h_index[term]][first + one];
+        }
+    }
+    for (int32_t one = 0, one_end = hypotheses->count; one < one_end; one++) {
+        real off_m = hypotheses->old[one] - hypotheses->old[likely];
+        total += hypotheses->weight[one] * square(off_m - (real)floor_real(off_m / cycle_m + REAL(0.5)) * cycle_m);
+    }
+    return (spread_of_h_results){hypotheses->old[likely], total};
+}
+
 /* Replace all hypotheses by their mean. P gains their scatter. */
 INTERNAL void give_up_hypotheses(State *s) {
     Hypotheses *hypotheses = &s->hypotheses;
@@ -3469,7 +3541,17 @@ INTERNAL void adapt_clock_noise(State *s, int32_t anchor, real normalised) {
     Anchor *a = &s->anchors[anchor];
     a->relay_mean += s->tuning.mean_gain * (normalised - a->relay_mean);
     real least = least_scale(s, s->status.anchors_walk);
-    a->walk_scale = adapted(s, a->walk_scale, is_off_zero(s, a->relay_mean), least, s->tuning.max_walk_scale);
+    bool is_off = is_off_zero(s, a->relay_mean);
+    if (PHASE_STATES > 0 && a->mesh.is_known) {  /* rather than its clock wander, its cycles are wrong */
+        if (is_off_zero(s, a->relay_mean * s->tuning.suspect / s->settings.gate)) {
+            int32_t offset = s->layout.offset + anchor;
+            s->P[at(offset, offset)] += square(s->tuning.slip_std_m);
+            a->mesh.is_known = false;
+            a->relay_mean = REAL(0.0);
+        }
+        is_off = false;
+    }
+    a->walk_scale = adapted(s, a->walk_scale, is_off, least, s->tuning.max_walk_scale);
 }
 
 /* Factor on the settings' random walk of a clock below which it is not adapted, by what its rates have shown. */
@@ -4096,6 +4178,7 @@ INTERNAL void first_reception(State *s, int32_t anchor, int64_t rx_ticks, int64_
     s->x[offset] = rest_m - range_m - curvature_m - h_dot_x(s, direction_terms(s));
     a->has_tx_noise = true;
     a->range_m = range_m;
+    a->noise_ticks = s->status.epoch_ticks;
 }
 
 /* Initialise the covariance of a state from a measurement: the limit of an update of an unknown state.
@@ -4153,7 +4236,17 @@ INTERNAL void relay_terms(State *s, int32_t listener, int32_t sender, real age_s
 INTERNAL real relay_variance(State *s, int32_t listener, int32_t sender, real age_s) {
     EstimatorSettings *settings = &s->settings;
     real walk = settings->walk * max_real(s->anchors[listener].walk_scale, s->anchors[sender].walk_scale);
+    if (has_order(s)) {
+        return settings->rx_variance_m2 + noise_since(s, listener, age_s) + noise_since(s, sender, age_s);
+    }
     return settings->rx_variance_m2 + REAL(2.0) * age_s * (settings->white + walk * age_s * age_s / REAL(3.0));
+}
+
+/* Variance of an anchor's clock by its noise that P contains of this time. */
+INTERNAL real noise_since(State *s, int32_t anchor, real age_s) {
+    real since_s = max_real(age_s - (real)(s->status.epoch_ticks - s->anchors[anchor].noise_ticks) * TICK_S, REAL(0.0));
+    real walk = s->settings.walk * s->anchors[anchor].walk_scale;
+    return since_s * (s->settings.white + walk * since_s * since_s / REAL(3.0));
 }
 
 /* Time since an anchor received a packet that the tag received too. */
@@ -5052,7 +5145,7 @@ INTERNAL void measure_speed(State *s, real dt) {
 /* Carrier phase: 20 times as precise as a stamp, but known only modulo a wavelength.
  *
  *     R − X  =  |p − a| + b + ambiguity + noise                 (mod λ)      (the tag receives an anchor)
- *     S − X  =  |aᵢ − aⱼ| + bⱼ − bᵢ + ambiguity + noise         (mod λ)      (anchor i receives its partner j)
+ *     S − X  =  |aᵢ − aⱼ| + bⱼ − bᵢ + γᵢ − γⱼ + constant + noise (mod λ)     (anchor i receives anchor j)
  *
  * X is the sender's counter when the frame leaves: the carrier starts at a phase given by the counter, so the noise of the
  * TX stamp is not in it. An ambiguity contains what is constant while both radios keep their supply, and the effect of
@@ -5090,7 +5183,7 @@ INTERNAL void own_phase(State *s, int32_t anchor, real phase_cycles) {
     real predicted = max_real(compute_ph(s), REAL(0.0));  /* rounding may make it negative */
     bool is_informative = a->own.is_known && square(s->settings.gate) * (predicted + variance) <
             square(wavelength_m(s));
-    bool is_used = use_phase(s, ambiguity, &a->own, innovation, predicted, variance, true);
+    bool is_used = use_phase(s, ambiguity, &a->own, innovation, predicted, variance);
     if (is_informative) {
         count_wild(s, predicted + variance);
     }
@@ -5099,33 +5192,88 @@ INTERNAL void own_phase(State *s, int32_t anchor, real phase_cycles) {
     }
 }
 
-/* Process the phase of an anchor's reception of its partner, whose stamp was used; ignore other senders.
+/* Process the phase of an anchor's reception of another one, whose stamp was used.
  *
- * The partner is the relayed anchor of lowest identifier, so that all clocks are tied to one. */
+ * The clock that phases show of an anchor differs from that of its stamps by γ, which its first pair determines. All
+ * other pairs have constants, which are estimated outside the filter. */
 INTERNAL void relay_phase(State *s, int32_t listener, int32_t sender, int64_t packet_rx_ticks, real phase_cycles) {
     Anchor *i = &s->anchors[listener];
     Anchor *j = &s->anchors[sender];
-    EstimatorSettings *settings = &s->settings;
-    Layout *where = &s->layout;
+    Link *link = &s->links[listener][sender];
+    int32_t mesh = s->layout.mesh;
     finish_updates(s);
-    bool is_silent = (real)(s->status.epoch_ticks - i->mesh.ticks) * TICK_S > settings->relay_age_s;
-    if (!i->mesh.is_known || j->identifier < i->partner || is_silent) {
-        i->mesh.is_known = i->mesh.is_known && i->partner == j->identifier && !is_silent;
-        i->partner = j->identifier;
-    }
-    if (i->partner != j->identifier || !j->has_rate) {
+    if (!j->has_rate || !agree(s) || !has_mesh(s, sender)) {
         return;
     }
     real age_s = relay_age_s(s, listener, sender, packet_rx_ticks);
     relay_terms(s, listener, sender, age_s, false);
     real expected_m = find_distance_m(s, listener, sender) + h_dot_x(s, 0);
-    add_term(s, where->mesh + listener, REAL(1.0));
-    real cycles = -phase_cycles - whole_cycles(s, j->offset_ticks - i->offset_ticks);
-    real variance = square(s->tuning.phase_mesh_std_m) + relay_variance(s, listener, sender, age_s) -
-            settings->rx_variance_m2;
-    real innovation = innovation_m(s, cycles, expected_m + s->x[where->mesh + listener]);
-    bool is_slow = s->status.recent_square < REAL(4.0) * square(s->tuning.phase_walking_mps);  /* a fast tag's own need all hypotheses */
-    use_phase(s, where->mesh + listener, &i->mesh, innovation, max_real(compute_ph(s), REAL(0.0)), variance, is_slow);
+    add_term(s, mesh + sender, -REAL(1.0));
+    add_term(s, mesh + listener, REAL(1.0));
+    expected_m += s->x[mesh + listener] - s->x[mesh + sender] + link->phase_m;
+    real innovation = innovation_m(s, -phase_cycles - whole_cycles(s, j->offset_ticks - i->offset_ticks), expected_m);
+    real predicted = max_real(compute_ph(s), REAL(0.0));
+    real aged_m2 = relay_variance(s, listener, sender, age_s) - s->settings.rx_variance_m2;
+    real variance = square(s->tuning.phase_mesh_std_m) + aged_m2;
+    if (!i->mesh.is_known) {
+        if (link->has_phase || !has_pairs(s, listener)) {
+            link->has_phase = true;
+            open(s, mesh + listener, &i->mesh, innovation, variance + link->phase_variance_m2);
+        }
+        return;
+    }
+    const spread_of_h_results results_1 = spread_of_h(s, wavelength_m(s));
+    real likely_m = results_1.item_0;
+    real spread_m2 = results_1.item_1;
+    real shown_m2 = predicted + spread_m2 + variance;
+    real known_m2 = square(s->tuning.pair_share * wavelength_m(s));
+    if (!link->has_phase || link->phase_variance_m2 > known_m2) {
+        link->has_phase = true;
+        link->phases_refused = 0;
+        link->phase_m = link->phase_m + innovation - likely_m;
+        link->phase_variance_m2 = shown_m2;
+        return;
+    }
+    real expected_m2 = predicted + variance + link->phase_variance_m2;
+    real limit_m = SQRT(limit_m2(s, predicted, expected_m2));
+    if (!take_cycles(s, innovation, expected_m2, limit_m, wavelength_m(s))) {
+        s->status.phases_refused += 1;
+        link->phases_refused += 1;
+        if (link->phases_refused >= truncated(s->tuning.phases_in_row)) {
+            forget_pair_phase(link);
+        }
+        return;
+    }
+    s->status.phases_used += 1;
+    link->phases_refused = 0;
+    if (shown_m2 < known_m2) {
+        real share = link->phase_variance_m2 / (shown_m2 + link->phase_variance_m2);
+        real shown_m = innovation - likely_m;
+        link->phase_m += share * (shown_m - (real)floor_real(shown_m / wavelength_m(s) + REAL(0.5)) * wavelength_m(s));
+        link->phase_variance_m2 -= share * link->phase_variance_m2;
+    }
+}
+
+/* Whether the clock that phases show of an anchor is known; of the first one it is by definition that of stamps. */
+INTERNAL bool has_mesh(State *s, int32_t anchor) {
+    bool is_first = true;
+    for (int32_t one = 0, one_end = s->count; one < one_end; one++) {
+        is_first = is_first && !s->anchors[one].mesh.is_known;
+    }
+    if (is_first) {
+        reset_state(s, s->layout.mesh + anchor, REAL(0.0));
+        s->anchors[anchor].mesh.is_known = true;
+    }
+    return s->anchors[anchor].mesh.is_known;
+}
+
+/* Whether the constant of any pair of an anchor has been measured: its clock must then fit that. */
+INTERNAL bool has_pairs(State *s, int32_t anchor) {
+    bool has_pairs = false;
+    for (int32_t other = 0, other_end = s->count; other < other_end; other++) {
+        has_pairs = has_pairs || s->links[anchor][other].has_phase || s->links[other][anchor].has_phase;
+    }
+    return has_pairs;
 }
 
 /* Fractional cycles, in [0, 1), of a number of ticks. */
@@ -5151,46 +5299,46 @@ INTERNAL real innovation_m(State *s, real cycles, real expected_m) {
 
 /* Process the phase in ``h``, whose last term is its ambiguity, the state of that index. Returns False if unused.
  *
- * ``predicted``: hᵀ·P·h, as ``compute_ph`` found it; ``may_be_several``: whether it may be taken at several cycles. */
-INTERNAL bool use_phase(State *s, int32_t state, Ambiguity *one, real innovation, real predicted, real variance, bool
-        may_be_several) {
+ * ``predicted``: hᵀ·P·h, as ``compute_ph`` found it. */
+INTERNAL bool use_phase(State *s, int32_t state, Ambiguity *own, real innovation, real predicted, real variance) {
     Status *status = &s->status;
-    one->ticks = status->epoch_ticks;
-    bool is_certain = predicted <= certain_m2(s);
-    real within_m2 = square(s->settings.gate) * (predicted + variance);
-    if (is_certain) {
-        within_m2 = limit_m2(s, predicted + variance);
-    }
-    if (!one->is_known || !(is_certain || (may_be_several && are_few(s, within_m2)))) {
+    own->ticks = status->epoch_ticks;
+    real within_m2 = limit_m2(s, predicted, predicted + variance);
+    if (!own->is_known || !(predicted <= certain_m2(s) || are_few(s, within_m2))) {
         s->hypotheses.fit = REAL(0.0);
         for (int32_t cycle = -1; cycle < 2; cycle++) {
             real off_m = innovation + (real)cycle * wavelength_m(s);
             s->hypotheses.fit += exp_(-REAL(0.5) * square(off_m) / (predicted + variance));
         }
-        open(s, state, one, innovation, variance);
+        open(s, state, own, innovation, variance);
         return false;
     }
     if (!take_cycles(s, innovation, predicted + variance, SQRT(within_m2), wavelength_m(s))) {
         status->phases_refused += 1;
-        one->refused_in_row += 1;
-        if (one->refused_in_row >= truncated(s->tuning.phases_in_row)) {
-            open(s, state, one, innovation, variance);
+        own->refused_in_row += 1;
+        if (own->refused_in_row >= truncated(s->tuning.phases_in_row)) {
+            open(s, state, own, innovation, variance);
         }
         return false;
     }
-    one->refused_in_row = 0;
+    own->refused_in_row = 0;
     status->phases_used += 1;
     return true;
 }
 
 /* Whether the cycles within a distance are few enough, and phases so reliable, that hypotheses are of use. */
 INTERNAL bool are_few(State *s, real within_m2) {
-    return REAL(4.0) * within_m2 < square(s->tuning.most_cycles * wavelength_m(s)) && are_phases_reliable(s);
+    bool has_settled = s->status.walk_scale < s->tuning.phases_walk_scale;
+    return has_settled && REAL(4.0) * within_m2 < square(s->tuning.most_cycles * wavelength_m(s)) &&
+            are_phases_reliable(s);
 }
 
-/* Squared innovation beyond which a phase is more likely random than noisy, or may be off by a cycle. */
-INTERNAL real limit_m2(State *s, real variance) {
+/* Squared innovation beyond which a phase is not used: if its cycle is certain, where it is more likely random. */
+INTERNAL real limit_m2(State *s, real predicted, real variance) {
     real gate_squared = square(s->settings.gate);
+    if (predicted > certain_m2(s)) {
+        return gate_squared * variance;
+    }
     real odds = min_real(s->status.wild_share, REAL(0.5)) * SQRT(TWO_PI * variance) / wavelength_m(s);
     if (odds > REAL(1e-06)) {
         gate_squared = min_real(gate_squared, -REAL(2.0) * log_(odds));
@@ -5216,7 +5364,9 @@ INTERNAL void learn_noise(State *s, real shown_m2) {
             square(max_real(tuning->phase_max_std_m, s->settings.phase_std_m)));
 }
 
-/* Whether the tag's phases may be used: neither just after the start nor while stamps contradict the state. */
+/* Whether the tag's phases may be used: neither soon after the start nor while stamps contradict the state.
+ *
+ * If they contradict hypotheses, all of these may be wrong, and P is smaller than the position's error. */
 INTERNAL bool may_count(State *s) {
     Status *status = &s->status;
     Tuning *tuning = &s->tuning;
@@ -5224,20 +5374,21 @@ INTERNAL bool may_count(State *s) {
     if (!are_phases_reliable(s)) {
         give_up_hypotheses(s);
     }
-    if (status->mean_nis > tuning->wrong_nis || stay_apart(s)) {
+    bool are_wrong = s->hypotheses.count > 0 && status->mean_nis > tuning->phases_nis;
+    if (are_wrong) {
+        for (int32_t axis = 0, axis_end = s->dim; axis < axis_end; axis++) {
+            s->P[at(axis, axis)] += square(tuning->slip_std_m);
+        }
+    }
+    if (are_wrong || !agree(s)) {
         close_phases(s);
     }
-    bool is_settled = (real)(status->epoch_ticks - status->start_ticks) * TICK_S >= tuning->new_start_s;
-    return is_settled && status->mean_nis <= tuning->wrong_nis;
+    return agree(s) && (real)(status->epoch_ticks - status->start_ticks) * TICK_S >= tuning->phases_start_s;
 }
 
-/* Whether the positions of hypotheses differ by more than stamps err. */
-INTERNAL bool stay_apart(State *s) {
-    real apart_m2 = REAL(0.0);
-    for (int32_t axis = 0, axis_end = s->dim; axis < axis_end; axis++) {
-        apart_m2 += scatter(s, axis, axis);
-    }
-    return apart_m2 > square(s->tuning.apart_m);
+/* Whether stamps do not contradict the state. */
+INTERNAL bool agree(State *s) {
+    return s->status.mean_nis <= s->tuning.wrong_nis;
 }
 
 /* Restart all ambiguities of the tag's receptions, which may be wrong by cycles. */
@@ -5511,6 +5662,10 @@ INTERNAL int32_t process_of(State *s, int32_t anchor, Packet *packet, Relays *re
     }
     status->stale_in_row = 0;
     advance_to(s, rx_ticks);
+    if (has_order(s)) {
+        process_relays(s, packet, relays);
+        add_clock_noise(s, anchor, rx_ticks);
+    }
     if (outcome == JOINED) {
         first_reception(s, anchor, rx_ticks, tx_ticks, packet->variance_factor);
     } else {
@@ -5520,11 +5675,7 @@ INTERNAL int32_t process_of(State *s, int32_t anchor, Packet *packet, Relays *re
         }
         outcome = result == USED ? ACCEPTED : REJECTED;
         if (PHASE_STATES > 0 && packet->has_phase && s->settings.carrier_cycles > 0) {
-            if (result == USED) {
-                own_phase(s, anchor, packet->phase_cycles);
-            } else if (a->outliers_in_row > 1) {
-                close_phases(s);
-            }
+            process_phase(s, anchor, packet->phase_cycles, result == USED);
         }
     }
     bool is_known = a->packets > 0;
@@ -5533,10 +5684,9 @@ INTERNAL int32_t process_of(State *s, int32_t anchor, Packet *packet, Relays *re
     if (is_known) {
         status->relays_lately_accepted *= REAL(1.0) - s->tuning.mean_gain;
         status->relays_lately_rejected *= REAL(1.0) - s->tuning.mean_gain;
-        for (int32_t one = 0, one_end = relays->count; one < one_end; one++) {
-            process_relay(s, &relays->rows[one]);
+        if (!has_order(s)) {
+            process_relays(s, packet, relays);
         }
-        finish_updates(s);
         if (packet->report_variance_m2 > REAL(0.0) && packet->master >= 0) {
             int32_t master = skyless_find_anchor(s, packet->master);
             if (master >= 0 && master != anchor) {
@@ -5607,8 +5757,25 @@ INTERNAL void keep_packet(State *s, int32_t anchor, Packet *packet) {
     kept->rx_ticks = packet->rx_ticks;
 }
 
+/* Process the phase of a reception, if the stamp was used. */
+INTERNAL void process_phase(State *s, int32_t anchor, real phase_cycles, bool is_used) {
+    if (is_used) {
+        own_phase(s, anchor, phase_cycles);
+    } else if (s->anchors[anchor].outliers_in_row > 1) {
+        close_phases(s);
+    }
+}
+
+/* Process the relays of a packet: as listed, the newest first, or in order. */
+INTERNAL void process_relays(State *s, Packet *packet, Relays *relays) {
+    for (int32_t one = 0, one_end = relays->count; one < one_end; one++) {
+        process_relay(s, packet, &relays->rows[has_order(s) ? relays->count - 1 - one : one]);
+    }
+    finish_updates(s);
+}
+
 /* Process a relay once, if the tag has received that packet. */
-INTERNAL void process_relay(State *s, Relay *relayed) {
+INTERNAL void process_relay(State *s, Packet *packet, Relay *relayed) {
     int32_t listener = skyless_find_anchor(s, relayed->listener);
     int32_t sender = skyless_find_anchor(s, relayed->anchor);
     if (listener < 0 || sender < 0 || sender == listener || !s->anchors[listener].has_rate) {
@@ -5619,8 +5786,11 @@ INTERNAL void process_relay(State *s, Relay *relayed) {
     bool is_young = (real)(s->status.epoch_ticks - kept->rx_ticks) * TICK_S < s->settings.relay_age_s;
     if (kept->sequence == relayed->sequence && kept->tx_ticks > link->tx_ticks && is_young) {
         link->tx_ticks = kept->tx_ticks;
-        Anchor *i = &s->anchors[listener];
-        int64_t rx_ticks = relay_rx_ticks(relayed, i->tx_ticks, i->rx_ticks - kept->rx_ticks);
+        int64_t rx_ticks = relay_rx_ticks(relayed, packet->tx_ticks, packet->rx_ticks - kept->rx_ticks);
+        if (has_order(s)) {
+            add_clock_noise(s, sender, kept->rx_ticks);
+            add_clock_noise(s, listener, kept->rx_ticks);
+        }
         bool is_used = relay(s, listener, sender, kept->tx_ticks, kept->rx_ticks, rx_ticks);
         if (PHASE_STATES > 0 && is_used && relayed->has_phase && s->status.has_phases) {
             relay_phase(s, listener, sender, kept->rx_ticks, relayed->phase_cycles);
@@ -7835,10 +8005,11 @@ SKYLESS_EXPORT void skyless_begin_tag(Tag *t, int32_t site, real qa, real lowest
             REAL(1.0), .moving_window = REAL(20.0), .moving_std_m = REAL(1.5), .moving_nis = REAL(1.5), .moving_apart =
             REAL(6.0), .median_difference_std_m = REAL(0.08), .late_start_std_m = REAL(0.14), .rival_m = REAL(0.5),
             .height_margin_m = REAL(1.0), .neighbourhood = REAL(1.5), .most_horizontal_std_m = REAL(3.0),
-            .zero_variance_m2 = REAL(10000.0), .phase_start_std_m = REAL(0.002), .phase_max_std_m = REAL(0.006),
-            .phase_mesh_std_m = REAL(0.0012), .phase_wander = REAL(25.0), .phase_gate = REAL(0.35), .phase_share =
-            REAL(0.1), .phase_step_m = REAL(0.02), .most_cycles = REAL(3.0), .start_wild = REAL(0.009), .least_wild =
-            REAL(0.002), .most_wild = REAL(0.01), .unlikely_log_odds = REAL(14.0), .apart_m = REAL(0.03),
+            .zero_variance_m2 = REAL(10000.0), .phases_start_s = REAL(2.0), .phase_start_std_m = REAL(0.003),
+            .phase_max_std_m = REAL(0.006), .phase_mesh_std_m = REAL(0.0012), .phase_wander = REAL(25.0), .phase_gate =
+            REAL(0.35), .phase_share = REAL(0.1), .phase_step_m = REAL(0.02), .pair_share = REAL(0.2), .phases_nis =
+            REAL(1.6), .slip_std_m = REAL(0.05), .phases_walk_scale = REAL(8.0), .most_cycles = REAL(4.0), .start_wild =
+            REAL(0.009), .least_wild = REAL(0.002), .most_wild = REAL(0.01), .unlikely_log_odds = REAL(14.0),
             .phase_walking_mps = REAL(0.7), .speed_memory_s = REAL(1.0), .phases_in_row = REAL(4.0), .uncovered_chi2 =
             REAL(240.0), .max_open_level_std = REAL(0.02), .contradicted_start_s = REAL(5.0), .probe_m = REAL(1.0),
             .shift_part = REAL(0.25), .apart_chi2 = REAL(20.0), .sensor_valid_s = REAL(1.0)}, .is_starting = true,

@@ -845,6 +845,8 @@ typedef struct Tuning {
     real neighbourhood;
     real most_horizontal_std_m;  /* Largest horizontal standard deviation of a fix [m]. */
     real zero_variance_m2;  /* Initial variance of a barometer's zero [m²]. */
+    /* Time from a start until the tag's phases are used: by then constants of pairs of anchors are known [s]. */
+    real phases_start_s;
     real phase_start_std_m;  /* Standard deviation of a phase until innovations show another [m] … */
     real phase_max_std_m;  /* … and its upper limit, unless the settings exceed it [m]. */
     real phase_mesh_std_m;  /* Standard deviation of a phase that an anchor measured of another [m]. */
@@ -855,13 +857,21 @@ typedef struct Tuning {
     /* Largest standard deviation of a prediction that determines the cycle, as a fraction of a wavelength. */
     real phase_share;
     real phase_step_m;  /* Length of the steps by which reflections change phases [m]. */
+    /* Largest standard deviation of a pair's constant at which its phases are used, and of one of these at which it
+     * changes the constant, as a fraction of a wavelength. */
+    real pair_share;
+    real phases_nis;  /* Mean NIS beyond which all hypotheses on cycles are given up … */
+    /* … and what is then added to the standard deviation of the position, or to that of an anchor's clock whose relays'
+     * stamps contradict their phases: about a wavelength [m]. */
+    real slip_std_m;
+    /* Largest factor on the random walk of the tag's clock at which phases are taken at several cycles. */
+    real phases_walk_scale;
     real most_cycles;  /* Number of cycles within the gate beyond which hypotheses on them are of no use. */
     /* Share of wild phases at a start: hypotheses are possible, but not for long if one looks wild. */
     real start_wild;
     real least_wild;  /* Share of wild phases that is expected at least, so that they can be found. */
     real most_wild;  /* Share beyond which hypotheses on cycles are misleading. */
     real unlikely_log_odds;  /* Logarithm of the odds against a hypothesis beyond which it is dropped. */
-    real apart_m;  /* Standard deviation of the positions of hypotheses beyond which they are given up [m]. */
     real phase_walking_mps;  /* The same as ``walking_mps`` while phases may be taken at several cycles [m/s] … */
     real speed_memory_s;  /* … for the largest speed within this time [s]. */
     real phases_in_row;  /* Consecutive phases of an anchor beyond the gate at which its ambiguity restarts. */
@@ -1046,6 +1056,8 @@ typedef struct Status {
     real plane_m[3];  /* A point of the plane that fits the anchors best. */
     real plane_normal[3];  /* Normal of that plane. */
     bool has_phases;  /* Whether phases are in use, so that there are ambiguities. */
+    /* Whether relays are processed before the reception of the packet that brings them, the oldest first. */
+    bool is_in_order;
     int64_t rate_ticks;  /* Tag time at which rates of clocks were compared. */
     int64_t rate_changes;
     real anchors_walk;  /* Random walk of the anchors' clocks by changes of their rates [m²/s³]. */
@@ -1159,12 +1171,13 @@ typedef struct Anchor {
     real place_walked_m;  /* The tag's walked distance at the newest step. */
     real place_residual_m[2];  /* Residuals of its receptions after the last two steps. */
     Ambiguity own;  /* Ambiguity of the tag's receptions of it. */
-    Ambiguity mesh;  /* Ambiguity of its receptions of its partner. */
+    Ambiguity mesh;  /* Difference between its clock as phases of relays show it and that of its stamps. */
     int64_t rate_offset_ticks;  /* Its offset when rates of clocks were compared … */
     real rate_offset_m;  /* … and the rest of it. */
     real mean_rate_mps;  /* Its mean rate from the comparison before. */
     int32_t rates;  /* Consecutive comparisons that it took part in. */
-    int32_t partner;  /* Identifier of the partner, −1 if none. */
+    /* Tag time up to which P contains the noise of its own clock, if relays are processed in order. */
+    int64_t noise_ticks;
     real phase_way_m;  /* ``Status.way_m`` at its newest phase. */
 } Anchor;
 
@@ -1183,6 +1196,10 @@ typedef struct Link {
     real variance_m2;  /* … and its variance. */
     int32_t outliers_in_row;
     bool contradicts;  /* Whether its range contradicts the survey. */
+    bool has_phase;  /* Whether the constant of phases in this direction has been measured … */
+    real phase_m;  /* … its value modulo the wavelength … */
+    real phase_variance_m2;  /* … and its variance. */
+    int32_t phases_refused;  /* Consecutive phases beyond the gate. */
 } Link;
 
 /* The estimator's state of one tag. What loops run over comes first, so that its rows fill cache lines. */
