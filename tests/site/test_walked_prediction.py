@@ -24,9 +24,9 @@ PLACE = np.array([[2.0, 3.0, 0.0], [4.5, 5.5, 0.0]])
 
 @pytest.mark.parametrize("has_phases", [False, True])
 def test_the_filter_claims_the_bound_of_a_tag_that_has_walked(has_phases):
-    """Nearly: the bound's phases begin with the first frame, the filter's after a second."""
+    """Nearly: the bound's phases begin with the first frame, the filter's after two seconds."""
     anchors, noise, slot_s = anchor_positions(LAB), LAB.noise, schedule_of(LAB).slot_ticks * TICK_S
-    frames, rested = round(1.0 / (6 * slot_s)) * 6, round(2.0 / (6 * slot_s)) * 6
+    frames, rested = round(1.0 / (6 * slot_s)) * 6, round(3.0 / (6 * slot_s)) * 6
     settings = BoundSettings(
         noise.tx_stamp_ps * 1e-12,
         white_fm=noise.white_fm,
@@ -36,8 +36,8 @@ def test_the_filter_claims_the_bound_of_a_tag_that_has_walked(has_phases):
         speed_std_mps=1.0,
         mesh=True,
         at_once=False,
-        phase_std_m=0.002 if has_phases else math.inf,
-        phase_wander=1e-4,
+        phase_std_m=0.003 if has_phases else math.inf,
+        phase_wander=25.0 * 0.003**2,
     )
     found = Predictor(LAB, ChannelModel()).walked_sigma(PLACE, has_phases=has_phases)
     ways = [(PLACE[0], np.eye(3)[0]), (PLACE[0], np.eye(3)[1]), (PLACE[1], -np.eye(3)[0]), (PLACE[1], -np.eye(3)[1])]

@@ -64,7 +64,7 @@ _COMPLETE_OVER_S: Final = 0.1
 _MAX_S: Final = 4.0
 _MAX_SUPERFRAMES: Final = 20
 
-_RESTED_S: Final = 2.0  # before a walk; phases count from a second after the start
+_RESTED_S: Final = 3.0  # before a walk; phases count from two seconds after the start
 
 _START_VARIANCE: Final = 1.0  # of position and velocity, m² and m²/s²; the steady state does not depend on it
 
