@@ -132,5 +132,7 @@ async def subscribed(link):
 
 
 async def stopped(task):
-    task.cancel()
-    await asyncio.wait([task])
+    """Cancel a task until it has ended: before Python 3.12 ``wait_for`` may lose a cancellation to its result."""
+    while not task.done():
+        task.cancel()
+        await asyncio.wait([task], timeout=1.0)
