@@ -96,7 +96,7 @@ def test_a_reset_of_a_radio_is_found(beacons):
 
 @pytest.mark.parametrize(("rate_hz", "seconds"), [(67.0, 5.0), (17.0, 15.0)])
 def test_constants_of_pairs_are_those_of_the_radios(rate_hz, seconds):
-    """One of each sender and one of each listener: what four pairs have is not independent."""
+    """Each is the sum of one of the sender and one of the listener, so those of four pairs fit each other."""
     beacons = heard(3, seconds, site=plain(rate_hz), room=Room(axis_std_m=0.0))
     _, s = fixes_of(with_phases(beacons, lambda _, one: one.carrier_phase_cycles))
     wavelength_m, worst_m = 128 / 13 * TICK_M, 0.0
