@@ -2,6 +2,9 @@
  * same numbers are added in the same order. What they compute says their Python (skyless/core/estimator/kalman.py); here
  * a load serves several rows, and a store several terms. What is left out, or more here, adds zeros. */
 
+#if PHASE_STATES > 0
+#error "inform here does not know updates that show no faults"
+#endif
 #pragma GCC optimize("O3")
 #define INLINE static inline __attribute__((always_inline))
 #define UNROLLED _Pragma("GCC unroll 8")

@@ -331,18 +331,20 @@ def update(s: State, innovation: float, innovation_variance: float, gain_scale: 
     _apply_updates(s)
 
 
-def update_later(s: State, innovation: float, innovation_variance: float) -> None:
-    """Queue an update by a measurement that also shows faults: y ← y + s·ν/S and M ← M + s·sᵀ/S.
+def update_later(s: State, innovation: float, innovation_variance: float, shows_faults: bool = True) -> None:
+    """Queue an update by a measurement. If it also shows faults: y ← y + s·ν/S and M ← M + s·sᵀ/S.
 
     P, V and M follow in ``finish_updates``; until then only ``compute_ph`` and ``compute_fault_input`` may read P and
     V. Lasting faults are updated at once.
     """
     g = s.G[s.waiting]
     normalised = innovation / sqrt(innovation_variance)
+    s.shows_faults[s.waiting] = 1.0 if shows_faults else 0.0
     _note_update(s, innovation, innovation_variance, 1.0)
-    for fault in range(FAULT_KINDS * s.count):
-        s.evidence[fault] += g[fault] * normalised
-    learn_lasting(s, g, 1.0, normalised)
+    if shows_faults:
+        for fault in range(FAULT_KINDS * s.count):
+            s.evidence[fault] += g[fault] * normalised
+        learn_lasting(s, g, 1.0, normalised)
 
 
 def _note_update(s: State, innovation: float, innovation_variance: float, gain_scale: float) -> None:
@@ -371,12 +373,13 @@ def finish_updates(s: State) -> None:
 
 
 def _inform(s: State) -> None:
-    """M ← M + Σ s·sᵀ/S over the queued updates, whose s/√S are in ``G``."""
+    """M ← M + Σ s·sᵀ/S over the queued updates that show faults; their s/√S are in ``G``."""
     faults = FAULT_KINDS * s.count
     for group in range(_fill_groups(s)):
         k = 4 * group
         for fault in range(faults):
-            a, b, c, d = s.G[k][fault], s.G[k + 1][fault], s.G[k + 2][fault], s.G[k + 3][fault]
+            a, b = s.shows_faults[k] * s.G[k][fault], s.shows_faults[k + 1] * s.G[k + 1][fault]
+            c, d = s.shows_faults[k + 2] * s.G[k + 2][fault], s.shows_faults[k + 3] * s.G[k + 3][fault]
             for other in range(fault + 1):
                 s.information[fault][other] += (
                     a * s.G[k][other] + b * s.G[k + 1][other] + c * s.G[k + 2][other] + d * s.G[k + 3][other]

@@ -15,7 +15,15 @@ stamp that was used. If it is not predicted to a tenth of a wavelength, it is ta
 
 from typing import Final
 
-from skyless.core.estimator.hypotheses import give_up_hypotheses, settle_hypotheses, spread_of_h, take_cycles
+from skyless.core.estimator.hypotheses import (
+    CYCLE_TICKS,
+    give_up_hypotheses,
+    likelihood,
+    settle_hypotheses,
+    spread_of_h,
+    take_cycles,
+    wavelength_m,
+)
 from skyless.core.estimator.kalman import (
     are_phases_reliable,
     compute_fault_input,
@@ -36,20 +44,18 @@ from skyless.core.estimator.measurements import (
 )
 from skyless.core.estimator.monitor import learn_least_walk
 from skyless.core.estimator.state import Ambiguity, State, at, forget_pair_phase, set_covariance, use_phases
-from skyless.core.native.arithmetic import exp, floor, log, sqrt, square
+from skyless.core.native.arithmetic import floor, log, sqrt, square
 from skyless.core.native.records import Reals, Ticks
-from skyless.core.ticks import TICK_M, TICK_S
+from skyless.core.ticks import TICK_S
 
-CYCLE_TICKS: Final = 128
-"""Number of ticks with a whole number of carrier cycles in every channel: ``EstimatorSettings.carrier_cycles``."""
 _TWO_PI: Final = 6.283185307179586
 
 
 def own_phase(s: State, anchor: int, phase_cycles: float) -> None:
     """Process the phase, in [0, 1), of a reception of the tag's whose stamp was used. It falls as stamps grow."""
     status, tuning, a = s.status, s.tuning, s.anchors[anchor]
-    use_phases(s)
     finish_updates(s)
+    use_phases(s)
     if not a.has_rate or not _may_count(s):
         a.own.is_known = False
         return
@@ -65,11 +71,11 @@ def own_phase(s: State, anchor: int, phase_cycles: float) -> None:
     cycles = -phase_cycles - _whole_cycles(s, a.offset_ticks)
     innovation, variance = _innovation_m(s, cycles, expected_m), status.phase_variance_m2
     predicted = max(compute_ph(s), 0.0)  # rounding may make it negative
-    is_informative = a.own.is_known and square(s.settings.gate) * (predicted + variance) < square(_wavelength_m(s))
+    compute_fault_input(s, -1)
+    if a.own.is_known and square(s.settings.gate) * (predicted + variance) < square(wavelength_m(s)):
+        _count_wild(s, innovation, predicted + variance)
     is_used = _use_phase(s, ambiguity, a.own, innovation, predicted, variance)
-    if is_informative:
-        _count_wild(s, predicted + variance)
-    if is_used and predicted <= _certain_m2(s) and s.hypotheses.count == 0:
+    if is_used and predicted <= _certain_m2(s) and s.hypotheses.count == 1:
         _learn_noise(s, square(innovation) - predicted)
 
 
@@ -80,7 +86,6 @@ def relay_phase(s: State, listener: int, sender: int, packet_rx_ticks: Ticks, ph
     other pairs have constants, which are estimated outside the filter.
     """
     i, j, link, mesh = s.anchors[listener], s.anchors[sender], s.links[listener][sender], s.layout.mesh
-    finish_updates(s)
     if not j.has_rate or not _agree(s) or not _has_mesh(s, sender):
         return
     age_s = relay_age_s(s, listener, sender, packet_rx_ticks)
@@ -90,22 +95,24 @@ def relay_phase(s: State, listener: int, sender: int, packet_rx_ticks: Ticks, ph
     add_term(s, mesh + listener, 1.0)
     expected_m += s.x[mesh + listener] - s.x[mesh + sender] + link.phase_m
     innovation = _innovation_m(s, -phase_cycles - _whole_cycles(s, j.offset_ticks - i.offset_ticks), expected_m)
-    predicted, aged_m2 = max(compute_ph(s), 0.0), relay_variance(s, listener, sender, age_s) - s.settings.rx_variance_m2
+    predicted = max(compute_ph(s), 0.0)
+    compute_fault_input(s, -1)
+    aged_m2 = relay_variance(s, listener, sender, age_s) - s.settings.rx_variance_m2
     variance = square(s.tuning.phase_mesh_std_m) + aged_m2
     if not i.mesh.is_known:
         if link.has_phase or not _has_pairs(s, listener):
             link.has_phase = True
             _open(s, mesh + listener, i.mesh, innovation, variance + link.phase_variance_m2)
         return
-    likely_m, spread_m2 = spread_of_h(s, _wavelength_m(s))
-    shown_m2, known_m2 = predicted + spread_m2 + variance, square(s.tuning.pair_share * _wavelength_m(s))
+    likely_m, spread_m2 = spread_of_h(s)
+    shown_m2, known_m2 = predicted + spread_m2 + variance, square(s.tuning.pair_share * wavelength_m(s))
     if not link.has_phase or link.phase_variance_m2 > known_m2:
         link.has_phase, link.phases_refused = True, 0
         link.phase_m, link.phase_variance_m2 = link.phase_m + innovation - likely_m, shown_m2
         return
     expected_m2 = predicted + variance + link.phase_variance_m2
     limit_m = sqrt(_limit_m2(s, predicted, expected_m2))
-    if not take_cycles(s, innovation, expected_m2, limit_m, _wavelength_m(s)):
+    if not take_cycles(s, innovation, expected_m2, limit_m):
         s.status.phases_refused += 1
         link.phases_refused += 1
         if link.phases_refused >= int(s.tuning.phases_in_row):
@@ -115,7 +122,7 @@ def relay_phase(s: State, listener: int, sender: int, packet_rx_ticks: Ticks, ph
     link.phases_refused = 0
     if shown_m2 < known_m2:
         share, shown_m = link.phase_variance_m2 / (shown_m2 + link.phase_variance_m2), innovation - likely_m
-        link.phase_m += share * (shown_m - floor(shown_m / _wavelength_m(s) + 0.5) * _wavelength_m(s))
+        link.phase_m += share * (shown_m - floor(shown_m / wavelength_m(s) + 0.5) * wavelength_m(s))
         link.phase_variance_m2 -= share * link.phase_variance_m2
 
 
@@ -125,6 +132,7 @@ def _has_mesh(s: State, anchor: int) -> bool:
     for one in range(s.count):
         is_first = is_first and not s.anchors[one].mesh.is_known
     if is_first:
+        finish_updates(s)
         reset_state(s, s.layout.mesh + anchor, 0.0)
         s.anchors[anchor].mesh.is_known = True
     return s.anchors[anchor].mesh.is_known
@@ -143,19 +151,15 @@ def _whole_cycles(s: State, ticks: Ticks) -> float:
     return ((ticks & (CYCLE_TICKS - 1)) * s.settings.carrier_cycles) % CYCLE_TICKS / CYCLE_TICKS
 
 
-def _wavelength_m(s: State) -> float:
-    return CYCLE_TICKS * TICK_M / s.settings.carrier_cycles
-
-
 def _certain_m2(s: State) -> float:
     """Largest variance of a prediction that determines the cycle."""
-    return square(s.tuning.phase_share * _wavelength_m(s))
+    return square(s.tuning.phase_share * wavelength_m(s))
 
 
 def _innovation_m(s: State, cycles: float, expected_m: float) -> float:
     """Difference between a phase and its prediction, to the nearest cycle."""
-    off = cycles - expected_m / _wavelength_m(s)
-    return (off - floor(off + 0.5)) * _wavelength_m(s)
+    off = cycles - expected_m / wavelength_m(s)
+    return (off - floor(off + 0.5)) * wavelength_m(s)
 
 
 def _use_phase(s: State, state: int, own: Ambiguity, innovation: float, predicted: float, variance: float) -> bool:
@@ -167,13 +171,9 @@ def _use_phase(s: State, state: int, own: Ambiguity, innovation: float, predicte
     own.ticks = status.epoch_ticks
     within_m2 = _limit_m2(s, predicted, predicted + variance)
     if not own.is_known or not (predicted <= _certain_m2(s) or _are_few(s, within_m2)):
-        s.hypotheses.fit = 0.0
-        for cycle in range(-1, 2):
-            off_m = innovation + cycle * _wavelength_m(s)
-            s.hypotheses.fit += exp(-0.5 * square(off_m) / (predicted + variance))
         _open(s, state, own, innovation, variance)
         return False
-    if not take_cycles(s, innovation, predicted + variance, sqrt(within_m2), _wavelength_m(s)):
+    if not take_cycles(s, innovation, predicted + variance, sqrt(within_m2)):
         status.phases_refused += 1
         own.refused_in_row += 1
         if own.refused_in_row >= int(s.tuning.phases_in_row):
@@ -187,7 +187,7 @@ def _use_phase(s: State, state: int, own: Ambiguity, innovation: float, predicte
 def _are_few(s: State, within_m2: float) -> bool:
     """Whether the cycles within a distance are few enough, and phases so reliable, that hypotheses are of use."""
     has_settled = s.status.walk_scale < s.tuning.phases_walk_scale
-    return has_settled and 4.0 * within_m2 < square(s.tuning.most_cycles * _wavelength_m(s)) and are_phases_reliable(s)
+    return has_settled and 4.0 * within_m2 < square(s.tuning.most_cycles * wavelength_m(s)) and are_phases_reliable(s)
 
 
 def _limit_m2(s: State, predicted: float, variance: float) -> float:
@@ -195,17 +195,17 @@ def _limit_m2(s: State, predicted: float, variance: float) -> float:
     gate_squared = square(s.settings.gate)
     if predicted > _certain_m2(s):
         return gate_squared * variance
-    odds = min(s.status.wild_share, 0.5) * sqrt(_TWO_PI * variance) / _wavelength_m(s)
+    odds = min(s.status.wild_share, 0.5) * sqrt(_TWO_PI * variance) / wavelength_m(s)
     if odds > 1e-6:
         gate_squared = min(gate_squared, -2.0 * log(odds))
-    return min(gate_squared * variance, square(s.tuning.phase_gate * _wavelength_m(s)))
+    return min(gate_squared * variance, square(s.tuning.phase_gate * wavelength_m(s)))
 
 
-def _count_wild(s: State, variance: float) -> None:
+def _count_wild(s: State, innovation: float, variance: float) -> None:
     """Update the share of wild phases by how likely the newest is one: all phases are then equally likely."""
     status, share = s.status, max(s.status.wild_share, s.tuning.least_wild)
-    wild = share * sqrt(_TWO_PI * variance) / _wavelength_m(s)
-    is_wild = wild / (wild + (1.0 - share) * s.hypotheses.fit)
+    wild = share * sqrt(_TWO_PI * variance) / wavelength_m(s)
+    is_wild = wild / (wild + (1.0 - share) * likelihood(s, innovation, variance))
     status.wild_share += s.tuning.slow_forgetting * (is_wild - status.wild_share)
 
 
@@ -228,11 +228,9 @@ def _may_count(s: State) -> bool:
     settle_hypotheses(s)
     if not are_phases_reliable(s):
         give_up_hypotheses(s)
-    are_wrong = s.hypotheses.count > 0 and status.mean_nis > tuning.phases_nis
-    if are_wrong:
-        for axis in range(s.dim):
+    if not _agree(s):
+        for axis in range(s.dim if s.hypotheses.count > 1 else 0):
             s.P[at(axis, axis)] += square(tuning.slip_std_m)
-    if are_wrong or not _agree(s):
         close_phases(s)
     return _agree(s) and (status.epoch_ticks - status.start_ticks) * TICK_S >= tuning.phases_start_s
 
@@ -329,6 +327,7 @@ def _phase_terms(s: State, anchor: int) -> float:
 
 def _open(s: State, state: int, one: Ambiguity, innovation: float, variance: float) -> None:
     """Start an ambiguity, the last term of ``h``, so that this phase agrees with it."""
+    finish_updates(s)
     s.status.phases_opened += 1
     one.is_known = True
     one.refused_in_row = int(s.tuning.phases_in_row) - 1  # if the next phase does not confirm this one, it was wrong
@@ -364,4 +363,4 @@ def known_phase(s: State, anchor: int, walked_m: float) -> None:
 def expected_phase(s: State, anchor: int) -> float:
     """The predicted phase of a reception in cycles, for which ``own_phase`` has an innovation of zero."""
     expected_m = _phase_terms(s, anchor)
-    return -(expected_m / _wavelength_m(s) + _whole_cycles(s, s.anchors[anchor].offset_ticks))
+    return -(expected_m / wavelength_m(s) + _whole_cycles(s, s.anchors[anchor].offset_ticks))

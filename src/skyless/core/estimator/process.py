@@ -251,6 +251,7 @@ def _process_of(s: State, anchor: int, packet: Packet, relays: Relays) -> int:
             master = find_anchor(s, packet.master)
             if master >= 0 and master != anchor:
                 report(s, anchor, master, packet.subticks, packet.report_variance_m2)
+    finish_updates(s)
     if PHASE_STATES > 0:
         settle_hypotheses(s)
     _check_motion_and_faults(s, elapsed_s)
@@ -371,7 +372,7 @@ def fill_fix(s: State) -> None:
     if MOTION_STATES > 0:
         fill_orientation(s)
     if PHASE_STATES > 0:
-        s.fix[ORIENTATION + 1][2] = max(s.hypotheses.count, 1) if follows_cycles(s) else 0
+        s.fix[ORIENTATION + 1][2] = s.hypotheses.count if follows_cycles(s) else 0
     protect(s)
     s.fix[QUALITY][0] = s.status.mean_nis
     s.fix[QUALITY][1] = s.status.mean_square_m2

@@ -305,14 +305,12 @@ class Tuning(Record):
     pair_share: float = 0.2
     """Largest standard deviation of a pair's constant at which its phases are used, and of one of these at which it
     changes the constant, as a fraction of a wavelength."""
-    phases_nis: float = 1.6
-    """Mean NIS beyond which all hypotheses on cycles are given up …"""
     slip_std_m: float = 0.05
-    """… and what is then added to the standard deviation of the position, or to that of an anchor's clock whose relays'
-    stamps contradict their phases: about a wavelength [m]."""
+    """What is added to the standard deviation of the position where stamps contradict all hypotheses on cycles, and to
+    that of an anchor's clock whose relays' stamps contradict their phases: about a wavelength [m]."""
     phases_walk_scale: float = 8.0
     """Largest factor on the random walk of the tag's clock at which phases are taken at several cycles."""
-    most_cycles: float = 4.0
+    most_cycles: float = 4.5
     """Number of cycles within the gate beyond which hypotheses on them are of no use."""
     start_wild: float = 0.009
     """Share of wild phases at a start: hypotheses are possible, but not for long if one looks wild."""
@@ -320,9 +318,11 @@ class Tuning(Record):
     """Share of wild phases that is expected at least, so that they can be found."""
     most_wild: float = 0.01
     """Share beyond which hypotheses on cycles are misleading."""
-    unlikely_log_odds: float = 14.0
+    unlikely_log_odds: float = 10.0
     """Logarithm of the odds against a hypothesis beyond which it is dropped."""
-    phase_walking_mps: float = 0.7
+    alike: float = 0.15
+    """Squared difference of two hypotheses, over the variance of each state, up to which they are merged."""
+    phase_walking_mps: float = 0.75
     """The same as ``walking_mps`` while phases may be taken at several cycles [m/s] …"""
     speed_memory_s: float = 1.0
     """… for the largest speed within this time [s]."""
@@ -381,7 +381,7 @@ class EstimatorSettings(Record):
     """Bounds of the tag's height."""
     carrier_cycles: int = 13
     """Carrier cycles in 128 ticks for the use of phases, 13 for channel 5; 0: phases are not used."""
-    phase_std_m: float = 0.0005
+    phase_std_m: float = 0.0015
     """Smallest standard deviation of a phase as the tag measures it."""
     phase_wander: float = 3e-5
     """Smallest change of an anchor's phases by reflections as the tag walks, m²/m."""

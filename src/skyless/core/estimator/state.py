@@ -181,9 +181,7 @@ class Hypotheses(Record):
     """
 
     count: int
-    """0 if all cycles are certain."""
-    fit: float
-    """Likelihood of the newest phase, of 1 for an innovation of zero."""
+    """1 if all cycles are certain; 0 as long as no phases are used."""
     weight: Annotated[Reals, HYPOTHESES + 1]
     log_weight: Annotated[Reals, HYPOTHESES + 1]
     """Logarithms of the present weights, up to a constant; ``weight`` is as of the newest mean."""
@@ -480,6 +478,8 @@ class State(Record):
     """u = P·h/√S of each queued update, then P·h of the current measurement."""
     G: Annotated[Matrix, MOST_WAITING, SENSITIVITIES]
     """Fault inputs over √S of each queued update, then those of the current measurement."""
+    shows_faults: Annotated[Reals, MOST_WAITING]
+    """1 for queued updates by measurements that show faults, and 0 for the others."""
     work: Annotated[Matrix, WORK_ROWS, MAX_ANCHORS]
     """Scratch for systems of equations of all faults of one kind."""
     levels: Annotated[Reals, LEVELS]
@@ -573,7 +573,7 @@ def prepare(s: State) -> None:
     """Initialise a state that is zero except for its settings and dimensions."""
     status, settings, tuning = s.status, s.settings, s.tuning
     stamps_m2 = settings.tx_variance_m2 + settings.rx_variance_m2
-    status.q_scale = status.mean_nis = 1.0
+    status.q_scale = status.mean_nis = s.hypotheses.weight[0] = 1.0
     status.height_ticks = NEVER
     status.walk_scale = tuning.start_walk_scale
     status.fault_std_m[LASTING] = tuning.lasting_std_m
@@ -698,6 +698,7 @@ def use_phases(s: State) -> None:
         for _ in range(2 * s.count):
             _insert_state(s, s.layout.change)
         s.status.has_phases = s.status.is_in_order = True
+        s.hypotheses.count = 1
         set_layout(s)
         for anchor in range(s.count):
             s.anchors[anchor].noise_ticks = s.status.epoch_ticks

@@ -199,7 +199,7 @@ INTERNAL real compute_ph(State *s);
 INTERNAL real h_dot(State *s, real *states);
 INTERNAL void compute_fault_input(State *s, int32_t own);
 INTERNAL void update(State *s, real innovation, real innovation_variance, real gain_scale);
-INTERNAL void update_later(State *s, real innovation, real innovation_variance);
+INTERNAL void update_later(State *s, real innovation, real innovation_variance, bool shows_faults);
 INTERNAL void note_update(State *s, real innovation, real innovation_variance, real gain_scale);
 INTERNAL void finish_updates(State *s);
 INTERNAL void inform(State *s);
@@ -229,13 +229,20 @@ INTERNAL bool relays_contradict(State *s);
 INTERNAL bool relays_fit(State *s);
 INTERNAL real horizontal_variance_m2(State *s, real ahead_s);
 INTERNAL bool fits_settings(State *s);
-INTERNAL bool take_cycles(State *s, real innovation, real variance, real limit_m, real cycle_m);
+INTERNAL real wavelength_m(State *s);
+INTERNAL bool take_cycles(State *s, real innovation, real variance, real limit_m);
+INTERNAL real innovation_of(State *s, real innovation, int32_t one);
+INTERNAL void branch(State *s, real innovation, real variance, real limit_m);
+INTERNAL real likelihood(State *s, real innovation, real variance);
 INTERNAL void keep_likely(State *s, int32_t parent, real shift_m, real log_weight);
 INTERNAL void replace(State *s, real inverse);
 INTERNAL void settle_hypotheses(State *s);
+INTERNAL void merge(State *s, int32_t one);
+INTERNAL bool are_alike(State *s, int32_t one, int32_t other);
+INTERNAL void drop(State *s, int32_t one);
 INTERNAL void set_count(State *s, int32_t count);
 INTERNAL real scatter(State *s, int32_t state, int32_t other);
-INTERNAL spread_of_h_results spread_of_h(State *s, real cycle_m);
+INTERNAL spread_of_h_results spread_of_h(State *s);
 INTERNAL void give_up_hypotheses(State *s);
 INTERNAL bool is_warm(State *s);
 INTERNAL void note_outlier(State *s, int32_t anchor, real innovation, real innovation_variance);
@@ -332,13 +339,12 @@ INTERNAL void relay_phase(State *s, int32_t listener, int32_t sender, int64_t pa
 INTERNAL bool has_mesh(State *s, int32_t anchor);
 INTERNAL bool has_pairs(State *s, int32_t anchor);
 INTERNAL real whole_cycles(State *s, int64_t ticks);
-INTERNAL real wavelength_m(State *s);
 INTERNAL real certain_m2(State *s);
 INTERNAL real innovation_m(State *s, real cycles, real expected_m);
 INTERNAL bool use_phase(State *s, int32_t state, Ambiguity *own, real innovation, real predicted, real variance);
 INTERNAL bool are_few(State *s, real within_m2);
 INTERNAL real limit_m2(State *s, real predicted, real variance);
-INTERNAL void count_wild(State *s, real variance);
+INTERNAL void count_wild(State *s, real innovation, real variance);
 INTERNAL void learn_noise(State *s, real shown_m2);
 INTERNAL bool may_count(State *s);
 INTERNAL bool agree(State *s);
@@ -1702,6 +1708,7 @@ INTERNAL void prepare(State *s) {
     EstimatorSettings *settings = &s->settings;
     Tuning *tuning = &s->tuning;
     real stamps_m2 = settings->tx_variance_m2 + settings->rx_variance_m2;
+    s->hypotheses.weight[0] = REAL(1.0);
     status->mean_nis = REAL(1.0);
     status->q_scale = REAL(1.0);
     status->height_ticks = NEVER;
@@ -1857,6 +1864,7 @@ INTERNAL void use_phases(State *s) {
         }
         s->status.is_in_order = true;
         s->status.has_phases = true;
+        s->hypotheses.count = 1;
         set_layout(s);
         for (int32_t anchor = 0, anchor_end = s->count; anchor < anchor_end; anchor++) {
             s->anchors[anchor].noise_ticks = s->status.epoch_ticks;
@@ -2527,18 +2535,21 @@ INTERNAL void update(State *s, real innovation, real innovation_variance, real g
     apply_updates(s);
 }
 
-/* Queue an update by a measurement that also shows faults: y ← y + s·ν/S and M ← M + s·sᵀ/S.
+/* Queue an update by a measurement. If it also shows faults: y ← y + s·ν/S and M ← M + s·sᵀ/S.
  *
  * P, V and M follow in ``finish_updates``; until then only ``compute_ph`` and ``compute_fault_input`` may read P and
  * V. Lasting faults are updated at once. */
-INTERNAL void update_later(State *s, real innovation, real innovation_variance) {
+INTERNAL void update_later(State *s, real innovation, real innovation_variance, bool shows_faults) {
     real *g = s->G[s->waiting];
     real normalised = innovation / SQRT(innovation_variance);
+    s->shows_faults[s->waiting] = shows_faults ? REAL(1.0) : REAL(0.0);
     note_update(s, innovation, innovation_variance, REAL(1.0));
-    for (int32_t fault = 0, fault_end = FAULT_KINDS * s->count; fault < fault_end; fault++) {
-        s->evidence[fault] += g[fault] * normalised;
+    if (shows_faults) {
+        for (int32_t fault = 0, fault_end = FAULT_KINDS * s->count; fault < fault_end; fault++) {
+            s->evidence[fault] += g[fault] * normalised;
+        }
+        learn_lasting(s, g, REAL(1.0), normalised);
     }
-    learn_lasting(s, g, REAL(1.0), normalised);
 }
 
 /* Update x, and scale the next of ``U`` and ``G`` to u = P·h/√S and g = s/√S for P and V. */
@@ -2575,16 +2586,16 @@ INTERNAL void finish_updates(State *s) {
 }
 
 #ifndef SKYLESS_BY_HAND
-/* M ← M + Σ s·sᵀ/S over the queued updates, whose s/√S are in ``G``. */
+/* M ← M + Σ s·sᵀ/S over the queued updates that show faults; their s/√S are in ``G``. */
 INTERNAL void inform(State *s) {
     int32_t faults = FAULT_KINDS * s->count;
     for (int32_t group = 0, group_end = fill_groups(s); group < group_end; group++) {
         int32_t k = 4 * group;
         for (int32_t fault = 0; fault < faults; fault++) {
-            real a = s->G[k][fault];
-            real b = s->G[k + 1][fault];
-            real c = s->G[k + 2][fault];
-            real d = s->G[k + 3][fault];
+            real a = s->shows_faults[k] * s->G[k][fault];
+            real b = s->shows_faults[k + 1] * s->G[k + 1][fault];
+            real c = s->shows_faults[k + 2] * s->G[k + 2][fault];
+            real d = s->shows_faults[k + 3] * s->G[k + 3][fault];
             for (int32_t other = 0; other < fault + 1; other++) {
                 s->information[fault][other] += a * s->G[k][other] + b * s->G[k + 1][other] + c * s->G[k + 2][other] + d
                         * s->G[k + 3][other];
@@ -3057,37 +3068,77 @@ INTERNAL bool fits_settings(State *s) {
  * treats them as such: the innovation of a hypothesis is ν − h·deviation. Its weight is the likelihood of all stamps and
  * phases since. An unlikely hypothesis is dropped, and only the most likely ones are kept. */
 
+/* The carrier's wavelength in use. */
+INTERNAL real wavelength_m(State *s) {
+    return (real)CYCLE_TICKS * TICK_M / (real)s->settings.carrier_cycles;
+}
+
 /* Process the phase in ``h`` at each cycle within a limit, for each hypothesis. Returns False if there is none.
  *
- * P·h is the next of ``U``; ``innovation`` is the mean's, at any cycle; ``variance``: of innovations; ``cycle_m``: the
- * wavelength. No updates may be queued. */
-INTERNAL bool take_cycles(State *s, real innovation, real variance, real limit_m, real cycle_m) {
+ * P·h and the fault inputs are the next of ``U`` and ``G``; ``innovation`` is the mean's, at any cycle; ``variance``:
+ * of innovations. If each hypothesis has one cycle, the update is queued. */
+INTERNAL bool take_cycles(State *s, real innovation, real variance, real limit_m) {
+    bool is_possible = false;
+    bool is_certain = true;
+    real cycle_m = wavelength_m(s);
+    for (int32_t one = 0, one_end = s->hypotheses.count; one < one_end; one++) {
+        real nearest_m = abs_real(innovation_of(s, innovation, one));
+        is_possible = is_possible || nearest_m <= limit_m;
+        is_certain = is_certain && cycle_m - nearest_m > limit_m;
+    }
+    if (is_possible && is_certain) {
+        for (int32_t one = 0, one_end = s->hypotheses.count; one < one_end; one++) {
+            s->G[s->waiting][FAULT_KINDS * s->count + one] = innovation_of(s, innovation, one) - innovation;
+        }
+        update_later(s, innovation, variance, false);
+    } else if (is_possible) {
+        branch(s, innovation, variance, limit_m);
+    }
+    return is_possible;
+}
+
+/* The innovation of a hypothesis at the nearest cycle. */
+INTERNAL real innovation_of(State *s, real innovation, int32_t one) {
+    real off_m = innovation + s->G[s->waiting][FAULT_KINDS * s->count + one];
+    return off_m - (real)floor_real(off_m / wavelength_m(s) + REAL(0.5)) * wavelength_m(s);
+}
+
+/* Replace the hypotheses by those that follow from them by a phase at each cycle within a limit. */
+INTERNAL void branch(State *s, real innovation, real variance, real limit_m) {
     Hypotheses *hypotheses = &s->hypotheses;
     int32_t first = FAULT_KINDS * s->count;
-    if (hypotheses->count == 0) {
-        hypotheses->log_weight[0] = REAL(0.0);
-        hypotheses->weight[0] = REAL(1.0);
-        set_count(s, 1);
-    }
+    real cycle_m = wavelength_m(s);
+    finish_updates(s);
+    compute_ph(s);
     compute_fault_input(s, -1);
     hypotheses->found = 0;
-    hypotheses->fit = REAL(0.0);
     for (int32_t parent = 0, parent_end = hypotheses->count; parent < parent_end; parent++) {
         real off_m = innovation + s->G[0][first + parent];
         for (int64_t cycle = -floor_real((limit_m + off_m) / cycle_m), cycle_end = floor_real((limit_m - off_m) /
                 cycle_m) + 1; cycle < cycle_end; cycle++) {
             real shift_m = (real)cycle * cycle_m;
-            real likelihood = -REAL(0.5) * square(off_m + shift_m) / variance;
-            hypotheses->fit += hypotheses->weight[parent] * exp_(likelihood);
-            keep_likely(s, parent, shift_m, hypotheses->log_weight[parent] + likelihood);
+            keep_likely(s, parent, shift_m, hypotheses->log_weight[parent] - REAL(0.5) * square(off_m + shift_m) /
+                    variance);
         }
     }
-    if (hypotheses->found > 0) {
-        update(s, innovation, variance, REAL(1.0));
-        replace(s, REAL(1.0) / SQRT(variance));
-    }
+    update(s, innovation, variance, REAL(1.0));
+    replace(s, REAL(1.0) / SQRT(variance));
     settle_hypotheses(s);
-    return hypotheses->found > 0;
+}
+
+/* Likelihood of the phase in ``h`` for all hypotheses together, of 1 for a certain cycle and an innovation of zero.
+ *
+ * The fault inputs are the next of ``G``. */
+INTERNAL real likelihood(State *s, real innovation, real variance) {
+    real total = REAL(0.0);
+    for (int32_t one = 0, one_end = s->hypotheses.count; one < one_end; one++) {
+        real nearest_m = innovation_of(s, innovation, one);
+        for (int32_t cycle = -1; cycle < 2; cycle++) {
+            real off_m = nearest_m + (real)cycle * wavelength_m(s);
+            total += s->hypotheses.weight[one] * exp_(-REAL(0.5) * square(off_m) / variance);
+        }
+    }
+    return total;
 }
 
 /* Keep a hypothesis that follows from another one by a cycle, if it is among the most likely ones, in order. */
@@ -3131,7 +3182,7 @@ INTERNAL void replace(State *s, real inverse) {
     set_count(s, hypotheses->found);
 }
 
-/* Drop unlikely hypotheses, and make x the mean of the others. No updates may be queued. */
+/* Drop unlikely hypotheses, merge those that have become alike, and make x the mean. No updates may be queued. */
 INTERNAL void settle_hypotheses(State *s) {
     Hypotheses *hypotheses = &s->hypotheses;
     int32_t first = FAULT_KINDS * s->count;
@@ -3149,13 +3200,9 @@ INTERNAL void settle_hypotheses(State *s) {
     }
     for (int32_t one = hypotheses->count - 1; one > -1; one--) {
         if (hypotheses->log_weight[one] < -s->tuning.unlikely_log_odds) {
-            int32_t last = hypotheses->count - 1;
-            hypotheses->log_weight[one] = hypotheses->log_weight[last];
-            hypotheses->weight[one] = hypotheses->weight[last];
-            for (int32_t state = 0, state_end = s->used; state < state_end; state++) {
-                s->V[state][first + one] = s->V[state][first + last];
-            }
-            set_count(s, last);
+            drop(s, one);
+        } else {
+            merge(s, one);
         }
     }
     for (int32_t one = 0, one_end = hypotheses->count; one < one_end; one++) {
@@ -3175,9 +3222,48 @@ INTERNAL void settle_hypotheses(State *s) {
             effects[first + one] -= mean;
         }
     }
-    if (hypotheses->count == 1) {
-        set_count(s, 0);
+}
+
+/* Add a hypothesis to an earlier one from which it does not differ any more. */
+INTERNAL void merge(State *s, int32_t one) {
+    Hypotheses *hypotheses = &s->hypotheses;
+    for (int32_t other = 0; other < one; other++) {
+        if (are_alike(s, one, other)) {
+            hypotheses->weight[other] += hypotheses->weight[one];
+            hypotheses->log_weight[other] = log_(hypotheses->weight[other]);
+            drop(s, one);
+            return;
+        }
     }
+}
+
+/* Whether two hypotheses differ by far less than their covariance in all states, of phases modulo a wavelength. */
+INTERNAL bool are_alike(State *s, int32_t one, int32_t other) {
+    int32_t first = FAULT_KINDS * s->count;
+    real cycle_m = wavelength_m(s);
+    for (int32_t state = 0, state_end = s->n; state < state_end; state++) {
+        real off = s->V[state][first + one] - s->V[state][first + other];
+        if (s->layout.ambiguity <= state && state < s->layout.change) {
+            off -= (real)floor_real(off / cycle_m + REAL(0.5)) * cycle_m;
+        }
+        if (square(off) > s->tuning.alike * s->P[at(state, state)]) {
+            return false;
+        }
+    }
+    return true;
+}
+
+/* Drop a hypothesis; the last one takes its place. */
+INTERNAL void drop(State *s, int32_t one) {
+    Hypotheses *hypotheses = &s->hypotheses;
+    int32_t first = FAULT_KINDS * s->count;
+    int32_t last = s->hypotheses.count - 1;
+    hypotheses->log_weight[one] = hypotheses->log_weight[last];
+    hypotheses->weight[one] = hypotheses->weight[last];
+    for (int32_t state = 0, state_end = s->used; state < state_end; state++) {
+        s->V[state][first + one] = s->V[state][first + last];
+    }
+    set_count(s, last);
 }
 
 /* Set the number of hypotheses; unused columns of V are zero. */
@@ -3204,29 +3290,26 @@ INTERNAL real scatter(State *s, int32_t state, int32_t other) {
     return total;
 }
 
-/* Deviation of the measurement in ``h`` by the most likely hypothesis, and the others' variance modulo a cycle. */
-INTERNAL spread_of_h_results spread_of_h(State *s, real cycle_m) {
+/* Deviation of the measurement in ``h`` by the most likely hypothesis, and the others' variance modulo a cycle.
+ *
+ * The fault inputs, which contain the deviations, are the next of ``G``. */
+INTERNAL spread_of_h_results spread_of_h(State *s) {
     Hypotheses *hypotheses = &s->hypotheses;
     int32_t likely = 0;
     int32_t first = FAULT_KINDS * s->count;
+    real cycle_m = wavelength_m(s);
     real total = REAL(0.0);
-    if (hypotheses->count == 0) {
-        return (spread_of_h_results){REAL(0.0), REAL(0.0)};
-    }
     for (int32_t one = 0, one_end = hypotheses->count; one < one_end; one++) {
         if (hypotheses->weight[one] > hypotheses->weight[likely]) {
             likely = one;
         }
-        hypotheses->old[one] = REAL(0.0);
-        for (int32_t term = 0, term_end = s->terms; term < term_end; term++) {
-            hypotheses->old[one] += s->h[term] * s->V[s->h_index[term]][first + one];
-        }
     }
+    real likely_m = -s->G[s->waiting][first + likely];
     for (int32_t one = 0, one_end = hypotheses->count; one < one_end; one++) {
-        real off_m = hypotheses->old[one] - hypotheses->old[likely];
+        real off_m = -s->G[s->waiting][first + one] - likely_m;
         total += hypotheses->weight[one] * square(off_m - (real)floor_real(off_m / cycle_m + REAL(0.5)) * cycle_m);
     }
-    return (spread_of_h_results){hypotheses->old[likely], total};
+    return (spread_of_h_results){likely_m, total};
 }
 
 /* Replace all hypotheses by their mean. P gains their scatter. */
@@ -3243,6 +3326,9 @@ INTERNAL void give_up_hypotheses(State *s) {
         }
     }
     set_count(s, 0);
+    set_count(s, 1);
+    hypotheses->log_weight[0] = REAL(0.0);
+    hypotheses->weight[0] = REAL(1.0);
 }
 
 /* Which measurements are used, and how process noise adapts to innovations.
@@ -4099,7 +4185,7 @@ INTERNAL bool use_reception(State *s, int32_t anchor, real innovation, real inno
         }
         real used_variance = innovation_variance * scale + (variance_factor - REAL(1.0)) * s->settings.rx_variance_m2;
         compute_fault_input(s, anchor);
-        update_later(s, innovation, used_variance);
+        update_later(s, innovation, used_variance, true);
     }
     return scale > REAL(0.0);
 }
@@ -4333,7 +4419,7 @@ INTERNAL real find_distance_m(State *s, int32_t one, int32_t other) {
 /* Queue an update, and its evidence of faults, by the measurement in ``h``, which is no reception of the tag's. */
 INTERNAL void use(State *s, real innovation, real innovation_variance) {
     compute_fault_input(s, -1);
-    update_later(s, innovation, innovation_variance);
+    update_later(s, innovation, innovation_variance, true);
 }
 
 /* Use the measured range between two anchors for their survey; an anchor that contradicts most is misplaced. */
@@ -4497,7 +4583,7 @@ INTERNAL int32_t difference(State *s, int32_t a, int32_t b, int64_t rx_ticks, re
     }
     compute_fault_input(s, b);
     subtract_fault_input(s, a);
-    update_later(s, innovation, innovation_variance * scale);
+    update_later(s, innovation, innovation_variance * scale, true);
     finish_updates(s);
     bound_changes(s);
     adapt_change_noise(s, a, -normalised);
@@ -5161,8 +5247,8 @@ INTERNAL void own_phase(State *s, int32_t anchor, real phase_cycles) {
     Status *status = &s->status;
     Tuning *tuning = &s->tuning;
     Anchor *a = &s->anchors[anchor];
-    use_phases(s);
     finish_updates(s);
+    use_phases(s);
     if (!a->has_rate || !may_count(s)) {
         a->own.is_known = false;
         return;
@@ -5181,13 +5267,12 @@ INTERNAL void own_phase(State *s, int32_t anchor, real phase_cycles) {
     real innovation = innovation_m(s, cycles, expected_m);
     real variance = status->phase_variance_m2;
     real predicted = max_real(compute_ph(s), REAL(0.0));  /* rounding may make it negative */
-    bool is_informative = a->own.is_known && square(s->settings.gate) * (predicted + variance) <
-            square(wavelength_m(s));
-    bool is_used = use_phase(s, ambiguity, &a->own, innovation, predicted, variance);
-    if (is_informative) {
-        count_wild(s, predicted + variance);
+    compute_fault_input(s, -1);
+    if (a->own.is_known && square(s->settings.gate) * (predicted + variance) < square(wavelength_m(s))) {
+        count_wild(s, innovation, predicted + variance);
     }
-    if (is_used && predicted <= certain_m2(s) && s->hypotheses.count == 0) {
+    bool is_used = use_phase(s, ambiguity, &a->own, innovation, predicted, variance);
+    if (is_used && predicted <= certain_m2(s) && s->hypotheses.count == 1) {
         learn_noise(s, square(innovation) - predicted);
     }
 }
@@ -5201,7 +5286,6 @@ INTERNAL void relay_phase(State *s, int32_t listener, int32_t sender, int64_t pa
     Anchor *j = &s->anchors[sender];
     Link *link = &s->links[listener][sender];
     int32_t mesh = s->layout.mesh;
-    finish_updates(s);
     if (!j->has_rate || !agree(s) || !has_mesh(s, sender)) {
         return;
     }
@@ -5213,6 +5297,7 @@ INTERNAL void relay_phase(State *s, int32_t listener, int32_t sender, int64_t pa
     expected_m += s->x[mesh + listener] - s->x[mesh + sender] + link->phase_m;
     real innovation = innovation_m(s, -phase_cycles - whole_cycles(s, j->offset_ticks - i->offset_ticks), expected_m);
     real predicted = max_real(compute_ph(s), REAL(0.0));
+    compute_fault_input(s, -1);
     real aged_m2 = relay_variance(s, listener, sender, age_s) - s->settings.rx_variance_m2;
     real variance = square(s->tuning.phase_mesh_std_m) + aged_m2;
     if (!i->mesh.is_known) {
@@ -5222,7 +5307,7 @@ INTERNAL void relay_phase(State *s, int32_t listener, int32_t sender, int64_t pa
         }
         return;
     }
-    const spread_of_h_results results_1 = spread_of_h(s, wavelength_m(s));
+    const spread_of_h_results results_1 = spread_of_h(s);
     real likely_m = results_1.item_0;
     real spread_m2 = results_1.item_1;
     real shown_m2 = predicted + spread_m2 + variance;
@@ -5236,7 +5321,7 @@ INTERNAL void relay_phase(State *s, int32_t listener, int32_t sender, int64_t pa
     }
     real expected_m2 = predicted + variance + link->phase_variance_m2;
     real limit_m = SQRT(limit_m2(s, predicted, expected_m2));
-    if (!take_cycles(s, innovation, expected_m2, limit_m, wavelength_m(s))) {
+    if (!take_cycles(s, innovation, expected_m2, limit_m)) {
         s->status.phases_refused += 1;
         link->phases_refused += 1;
         if (link->phases_refused >= truncated(s->tuning.phases_in_row)) {
@@ -5261,6 +5346,7 @@ INTERNAL bool has_mesh(State *s, int32_t anchor) {
         is_first = is_first && !s->anchors[one].mesh.is_known;
     }
     if (is_first) {
+        finish_updates(s);
         reset_state(s, s->layout.mesh + anchor, REAL(0.0));
         s->anchors[anchor].mesh.is_known = true;
     }
@@ -5282,10 +5368,6 @@ INTERNAL real whole_cycles(State *s, int64_t ticks) {
             (real)CYCLE_TICKS;
 }
 
-INTERNAL real wavelength_m(State *s) {
-    return (real)CYCLE_TICKS * TICK_M / (real)s->settings.carrier_cycles;
-}
-
 /* Largest variance of a prediction that determines the cycle. */
 INTERNAL real certain_m2(State *s) {
     return square(s->tuning.phase_share * wavelength_m(s));
@@ -5305,15 +5387,10 @@ INTERNAL bool use_phase(State *s, int32_t state, Ambiguity *own, real innovation
     own->ticks = status->epoch_ticks;
     real within_m2 = limit_m2(s, predicted, predicted + variance);
     if (!own->is_known || !(predicted <= certain_m2(s) || are_few(s, within_m2))) {
-        s->hypotheses.fit = REAL(0.0);
-        for (int32_t cycle = -1; cycle < 2; cycle++) {
-            real off_m = innovation + (real)cycle * wavelength_m(s);
-            s->hypotheses.fit += exp_(-REAL(0.5) * square(off_m) / (predicted + variance));
-        }
         open(s, state, own, innovation, variance);
         return false;
     }
-    if (!take_cycles(s, innovation, predicted + variance, SQRT(within_m2), wavelength_m(s))) {
+    if (!take_cycles(s, innovation, predicted + variance, SQRT(within_m2))) {
         status->phases_refused += 1;
         own->refused_in_row += 1;
         if (own->refused_in_row >= truncated(s->tuning.phases_in_row)) {
@@ -5347,11 +5424,11 @@ INTERNAL real limit_m2(State *s, real predicted, real variance) {
 }
 
 /* Update the share of wild phases by how likely the newest is one: all phases are then equally likely. */
-INTERNAL void count_wild(State *s, real variance) {
+INTERNAL void count_wild(State *s, real innovation, real variance) {
     Status *status = &s->status;
     real share = max_real(s->status.wild_share, s->tuning.least_wild);
     real wild = share * SQRT(TWO_PI * variance) / wavelength_m(s);
-    real is_wild = wild / (wild + (REAL(1.0) - share) * s->hypotheses.fit);
+    real is_wild = wild / (wild + (REAL(1.0) - share) * likelihood(s, innovation, variance));
     status->wild_share += s->tuning.slow_forgetting * (is_wild - status->wild_share);
 }
 
@@ -5374,13 +5451,10 @@ INTERNAL bool may_count(State *s) {
     if (!are_phases_reliable(s)) {
         give_up_hypotheses(s);
     }
-    bool are_wrong = s->hypotheses.count > 0 && status->mean_nis > tuning->phases_nis;
-    if (are_wrong) {
-        for (int32_t axis = 0, axis_end = s->dim; axis < axis_end; axis++) {
+    if (!agree(s)) {
+        for (int32_t axis = 0, axis_end = s->hypotheses.count > 1 ? s->dim : 0; axis < axis_end; axis++) {
             s->P[at(axis, axis)] += square(tuning->slip_std_m);
         }
-    }
-    if (are_wrong || !agree(s)) {
         close_phases(s);
     }
     return agree(s) && (real)(status->epoch_ticks - status->start_ticks) * TICK_S >= tuning->phases_start_s;
@@ -5498,6 +5572,7 @@ INTERNAL real phase_terms(State *s, int32_t anchor) {
 
 /* Start an ambiguity, the last term of ``h``, so that this phase agrees with it. */
 INTERNAL void open(State *s, int32_t state, Ambiguity *one, real innovation, real variance) {
+    finish_updates(s);
     s->status.phases_opened += 1;
     one->is_known = true;
     one->refused_in_row = truncated(s->tuning.phases_in_row) - 1;  /* if the next phase does not confirm this one, it was wrong */
@@ -5694,6 +5769,7 @@ INTERNAL int32_t process_of(State *s, int32_t anchor, Packet *packet, Relays *re
             }
         }
     }
+    finish_updates(s);
     if (PHASE_STATES > 0) {
         settle_hypotheses(s);
     }
@@ -5837,7 +5913,7 @@ INTERNAL void fill_fix(State *s) {
         fill_orientation(s);
     }
     if (PHASE_STATES > 0) {
-        s->fix[ORIENTATION + 1][2] = (real)(follows_cycles(s) ? max_32(s->hypotheses.count, 1) : 0);
+        s->fix[ORIENTATION + 1][2] = (real)(follows_cycles(s) ? s->hypotheses.count : 0);
     }
     protect(s);
     s->fix[QUALITY][0] = s->status.mean_nis;
@@ -6116,7 +6192,7 @@ INTERNAL void receive_relay(State *s, PlannedMessage *message, PlannedRelay *rel
     if (s->links[message->anchor][relayed->sender].variance_m2 == REAL(0.0)) {  /* else the pair's constant takes the delay */
         s->G[s->waiting][walls(s)] += relayed->late_m;
     }
-    update_later(s, REAL(0.0), variance);
+    update_later(s, REAL(0.0), variance, true);
 }
 
 /* Cramér–Rao bounds */
@@ -7954,7 +8030,7 @@ SKYLESS_EXPORT void skyless_begin_tag(Tag *t, int32_t site, real qa, real lowest
     t->owner = (EstimatorSettings){.qa = REAL(0.5), .start_speed_std_mps = REAL(2.0), .white = REAL(3.6e-05), .walk =
             REAL(0.09), .tx_variance_m2 = REAL(0.0009), .rx_variance_m2 = REAL(0.0009), .gate = REAL(4.0), .height_m =
             (real)__builtin_nan(""), .height_std_m = REAL(0.0), .lowest_m = (real)-__builtin_inf(), .highest_m =
-            (real)__builtin_inf(), .carrier_cycles = 13, .phase_std_m = REAL(0.0005), .phase_wander = REAL(3e-05),
+            (real)__builtin_inf(), .carrier_cycles = 13, .phase_std_m = REAL(0.0015), .phase_wander = REAL(3e-05),
             .drop_s = REAL(2.0), .relay_age_s = REAL(1.0), .survey_std_m = REAL(0.02), .range_std_m = REAL(0.03),
             .pair_std_m = REAL(0.02), .slope_std_m = REAL(0.05), .place_std_m = REAL(0.005), .place_distance_m =
             REAL(1.0), .place_time_s = REAL(100.0), .change_memory_s = REAL(0.0), .barometer_walk = REAL(0.00025),
@@ -7966,7 +8042,7 @@ SKYLESS_EXPORT void skyless_begin_tag(Tag *t, int32_t site, real qa, real lowest
     t->course = (Course){.settings = {.qa = REAL(0.5), .start_speed_std_mps = REAL(2.0), .white = REAL(3.6e-05), .walk =
             REAL(0.09), .tx_variance_m2 = REAL(0.0009), .rx_variance_m2 = REAL(0.0009), .gate = REAL(4.0), .height_m =
             (real)__builtin_nan(""), .height_std_m = REAL(0.0), .lowest_m = (real)-__builtin_inf(), .highest_m =
-            (real)__builtin_inf(), .carrier_cycles = 13, .phase_std_m = REAL(0.0005), .phase_wander = REAL(3e-05),
+            (real)__builtin_inf(), .carrier_cycles = 13, .phase_std_m = REAL(0.0015), .phase_wander = REAL(3e-05),
             .drop_s = REAL(2.0), .relay_age_s = REAL(1.0), .survey_std_m = REAL(0.02), .range_std_m = REAL(0.03),
             .pair_std_m = REAL(0.02), .slope_std_m = REAL(0.05), .place_std_m = REAL(0.005), .place_distance_m =
             REAL(1.0), .place_time_s = REAL(100.0), .change_memory_s = REAL(0.0), .barometer_walk = REAL(0.00025),
@@ -8007,10 +8083,10 @@ SKYLESS_EXPORT void skyless_begin_tag(Tag *t, int32_t site, real qa, real lowest
             .height_margin_m = REAL(1.0), .neighbourhood = REAL(1.5), .most_horizontal_std_m = REAL(3.0),
             .zero_variance_m2 = REAL(10000.0), .phases_start_s = REAL(2.0), .phase_start_std_m = REAL(0.003),
             .phase_max_std_m = REAL(0.006), .phase_mesh_std_m = REAL(0.0012), .phase_wander = REAL(25.0), .phase_gate =
-            REAL(0.35), .phase_share = REAL(0.1), .phase_step_m = REAL(0.02), .pair_share = REAL(0.2), .phases_nis =
-            REAL(1.6), .slip_std_m = REAL(0.05), .phases_walk_scale = REAL(8.0), .most_cycles = REAL(4.0), .start_wild =
-            REAL(0.009), .least_wild = REAL(0.002), .most_wild = REAL(0.01), .unlikely_log_odds = REAL(14.0),
-            .phase_walking_mps = REAL(0.7), .speed_memory_s = REAL(1.0), .phases_in_row = REAL(4.0), .uncovered_chi2 =
+            REAL(0.35), .phase_share = REAL(0.1), .phase_step_m = REAL(0.02), .pair_share = REAL(0.2), .slip_std_m =
+            REAL(0.05), .phases_walk_scale = REAL(8.0), .most_cycles = REAL(4.5), .start_wild = REAL(0.009), .least_wild
+            = REAL(0.002), .most_wild = REAL(0.01), .unlikely_log_odds = REAL(10.0), .alike = REAL(0.15),
+            .phase_walking_mps = REAL(0.75), .speed_memory_s = REAL(1.0), .phases_in_row = REAL(4.0), .uncovered_chi2 =
             REAL(240.0), .max_open_level_std = REAL(0.02), .contradicted_start_s = REAL(5.0), .probe_m = REAL(1.0),
             .shift_part = REAL(0.25), .apart_chi2 = REAL(20.0), .sensor_valid_s = REAL(1.0)}, .is_starting = true,
             .misfit = -1, .relays_may_contradict = true, .may_begin_again = true};

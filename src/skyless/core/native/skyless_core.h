@@ -860,9 +860,8 @@ typedef struct Tuning {
     /* Largest standard deviation of a pair's constant at which its phases are used, and of one of these at which it
      * changes the constant, as a fraction of a wavelength. */
     real pair_share;
-    real phases_nis;  /* Mean NIS beyond which all hypotheses on cycles are given up … */
-    /* … and what is then added to the standard deviation of the position, or to that of an anchor's clock whose relays'
-     * stamps contradict their phases: about a wavelength [m]. */
+    /* What is added to the standard deviation of the position where stamps contradict all hypotheses on cycles, and to
+     * that of an anchor's clock whose relays' stamps contradict their phases: about a wavelength [m]. */
     real slip_std_m;
     /* Largest factor on the random walk of the tag's clock at which phases are taken at several cycles. */
     real phases_walk_scale;
@@ -872,6 +871,8 @@ typedef struct Tuning {
     real least_wild;  /* Share of wild phases that is expected at least, so that they can be found. */
     real most_wild;  /* Share beyond which hypotheses on cycles are misleading. */
     real unlikely_log_odds;  /* Logarithm of the odds against a hypothesis beyond which it is dropped. */
+    /* Squared difference of two hypotheses, over the variance of each state, up to which they are merged. */
+    real alike;
     real phase_walking_mps;  /* The same as ``walking_mps`` while phases may be taken at several cycles [m/s] … */
     real speed_memory_s;  /* … for the largest speed within this time [s]. */
     real phases_in_row;  /* Consecutive phases of an anchor beyond the gate at which its ambiguity restarts. */
@@ -1121,8 +1122,7 @@ typedef struct Motion {
  *
  * Arrays have one element more than is used, as there may be no hypotheses at all. */
 typedef struct Hypotheses {
-    int32_t count;  /* 0 if all cycles are certain. */
-    real fit;  /* Likelihood of the newest phase, of 1 for an innovation of zero. */
+    int32_t count;  /* 1 if all cycles are certain; 0 as long as no phases are used. */
     real weight[HYPOTHESES + 1];
     /* Logarithms of the present weights, up to a constant; ``weight`` is as of the newest mean. */
     real log_weight[HYPOTHESES + 1];
@@ -1237,6 +1237,7 @@ typedef struct State {
     real U[MOST_WAITING][STATES];  /* u = P·h/√S of each queued update, then P·h of the current measurement. */
     /* Fault inputs over √S of each queued update, then those of the current measurement. */
     real G[MOST_WAITING][SENSITIVITIES];
+    real shows_faults[MOST_WAITING];  /* 1 for queued updates by measurements that show faults, and 0 for the others. */
     real work[WORK_ROWS][MAX_ANCHORS];  /* Scratch for systems of equations of all faults of one kind. */
     real levels[5];
     real fix[12][3];  /* Rows of a fix (``POSITION`` and the following). */

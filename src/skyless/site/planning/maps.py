@@ -170,7 +170,7 @@ class Predictor:
     def _state_at(self, rows: Integers, point: Vector, *, has_phases: bool = False) -> State:
         """The estimator's state at a point, with the anchors in these rows."""
         s = new_state(self.estimator)
-        s.status.walk_scale, s.status.has_phases = 1.0, has_phases
+        s.status.walk_scale, s.status.has_phases, s.hypotheses.count = 1.0, has_phases, int(has_phases)
         for axis in range(2 * s.dim):
             s.P[at(axis, axis)] = _START_VARIANCE
         for row in rows.tolist():
