@@ -27,6 +27,7 @@ from skyless.research.uncertainty import Biases
 from skyless.sim.evaluation.scenarios import Room, wanderer, wanderers
 from skyless.sim.impairments import AnchorBias, Body, CarrierModel, RangeErrorModel, WarmUp
 from skyless.sim.lab import lab_site, paper_lab_site
+from skyless.sim.motion_sensor import MotionErrors
 from skyless.sim.trajectory import Static, Trajectory, Waypoints
 
 BASE: Final = "the room"
@@ -368,6 +369,7 @@ def _phases(plan: Plan) -> list[Case]:
     in_lab = partial(walking, plan, paper_lab_site(plan.noise_ps))
     walled = replace(in_site, walls=(WALL,))
     past = partial(worlds, plan, walled, partial(past_wall, plan.tags), room=Room(), walls_between_anchors=False)
+    sensed = partial(_locking, plan, "hands", 100.0, 5e-9, sensor=MotionErrors())
     scenes: list[tuple[str, CarrierModel, Callable[..., tuple[Run, ...]], tuple[Limit, ...]]] = [
         ("lab, no reflections", quiet, in_lab, (Limit("rmse_m", most=0.005), *honest)),
         (BASE, usual, in_room, (Limit("rmse_m", most=0.022), Limit("nees", 0.7, 1.3), exceeded)),
@@ -378,6 +380,7 @@ def _phases(plan: Plan) -> list[Case]:
         ("past a wall", usual, past, (exceeded,)),
         ("a body", usual, partial(in_room, body=Body()), (exceeded,)),
         *((f"{one[0]}, {one[1]:g}/s, {one[2]:g}", usual, partial(_locking, plan, *one), honest) for one in _LOCKS),
+        ("hands, 100/s, 5e-09, motion sensor", usual, sensed, honest),
     ]
     found, never_worse = [], Limit("ratio", most=_PHASE_RATIO)
     for name, carrier, runs_of, limits in scenes:

@@ -27,6 +27,7 @@ from skyless.sim.evaluation.fleet import world_of
 from skyless.sim.evaluation.scenarios import ROOM_QA_M2PS3, WALL_MARGIN_M, Request, impairments_of, trajectories_of
 from skyless.sim.impairments import Impairments
 from skyless.sim.lab import paper_lab_site
+from skyless.sim.motion_sensor import MotionErrors, MotionSensor
 from skyless.sim.oscillator import OscillatorModel
 from skyless.sim.streams import stream
 from skyless.sim.trajectory import Trajectory
@@ -62,6 +63,8 @@ class Run(Struct, frozen=True):
     until_s: float
     lost_at_tags: float = 0.0
     """Probability that a tag does not hear a message which anchors may well hear."""
+    sensor: MotionErrors | None = None
+    """The tags' motion sensors; None for tags without."""
 
 
 class RunResult(Struct, frozen=True):
@@ -117,11 +120,15 @@ def beacons_of(run: Run) -> Iterator[Heard]:
 def judged(run: Run, beacons: Iterable[Heard]) -> RunResult:
     """Let the tags of a world compute their positions from what they received, and judge them."""
     tags, dim = len(run.trajectories), 2 if run.site.tags.height_m is not None else 3
-    receivers = [AnyReceiver(run.method) for _ in run.trajectories]
+    receivers, paths = [AnyReceiver(run.method) for _ in run.trajectories], enumerate(run.trajectories)
+    sensors = [MotionSensor(path, run.sensor, run.seed, tag) for tag, path in paths if run.sensor is not None]
     first_fixes, levels = FirstFixes(run.site, tags), LevelTally(tags, _SAMPLE_ROWS)
     sums, max_m, sample, outside_chi2 = np.zeros(4), 0.0, EvenSample(1, _SAMPLE_ROWS), float(chi2.ppf(_OUTSIDE, dim))
     messages, cpu_s = 0, 0.0
     for beacon in beacons:
+        for receiver, sensor in zip(receivers, sensors, strict=False):
+            for moved in sensor.until(beacon.end_s):
+                receiver.hear_motion(moved)
         begun_s = time.thread_time()
         fixes = [receivers[tag].hear(reception) for tag, reception, _ in beacon.receptions]
         cpu_s += time.thread_time() - begun_s
@@ -232,6 +239,7 @@ def worlds(
     *,
     assumed: Site | None = None,
     change: Callable[[Impairments], Impairments] | None = None,
+    sensor: MotionErrors | None = None,
     warmup_s: float = LAB_WARMUP_S,
     seconds: float | None = None,
     count: int | None = None,
@@ -259,6 +267,7 @@ def worlds(
                 warmup_s=warmup_s,
                 until_s=warmup_s + (seconds or plan.seconds),
                 lost_at_tags=lost_at_tags,
+                sensor=sensor,
             )
         )
     return tuple(runs)
