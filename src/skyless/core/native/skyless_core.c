@@ -3066,7 +3066,7 @@ INTERNAL bool fits_settings(State *s) {
  * the same variance. So the states that result have one P in common, and differ from their weighted mean, which is x, by a
  * vector each. These deviations are columns of V behind those of the faults, and every time update and measurement update
  * treats them as such: the innovation of a hypothesis is ν − h·deviation. Its weight is the likelihood of all stamps and
- * phases since. An unlikely hypothesis is dropped, and only the most likely ones are kept. */
+ * phases since. Unlikely hypotheses are dropped, alike ones are merged, and only the most likely ones are kept. */
 
 /* The carrier's wavelength in use. */
 INTERNAL real wavelength_m(State *s) {
