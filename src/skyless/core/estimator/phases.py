@@ -228,9 +228,11 @@ def _may_count(s: State) -> bool:
     settle_hypotheses(s)
     if not are_phases_reliable(s):
         give_up_hypotheses(s)
-    if not _agree(s):
-        for axis in range(s.dim if s.hypotheses.count > 1 else 0):
+    are_wrong = s.hypotheses.count > 1 and status.mean_nis > tuning.phases_nis
+    if are_wrong:
+        for axis in range(s.dim):
             s.P[at(axis, axis)] += square(tuning.slip_std_m)
+    if are_wrong or not _agree(s):
         close_phases(s)
     return _agree(s) and (status.epoch_ticks - status.start_ticks) * TICK_S >= tuning.phases_start_s
 

@@ -305,12 +305,14 @@ class Tuning(Record):
     pair_share: float = 0.2
     """Largest standard deviation of a pair's constant at which its phases are used, and of one of these at which it
     changes the constant, as a fraction of a wavelength."""
+    phases_nis: float = 1.6
+    """Mean NIS beyond which all hypotheses on cycles are given up …"""
     slip_std_m: float = 0.05
-    """What is added to the standard deviation of the position where stamps contradict all hypotheses on cycles, and to
-    that of an anchor's clock whose relays' stamps contradict their phases: about a wavelength [m]."""
+    """… and what is then added to the standard deviation of the position, or to that of an anchor's clock whose relays'
+    stamps contradict their phases: about a wavelength [m]."""
     phases_walk_scale: float = 8.0
     """Largest factor on the random walk of the tag's clock at which phases are taken at several cycles."""
-    most_cycles: float = 4.5
+    most_cycles: float = 4.0
     """Number of cycles within the gate beyond which hypotheses on them are of no use."""
     start_wild: float = 0.009
     """Share of wild phases at a start: hypotheses are possible, but not for long if one looks wild."""

@@ -5451,10 +5451,13 @@ INTERNAL bool may_count(State *s) {
     if (!are_phases_reliable(s)) {
         give_up_hypotheses(s);
     }
-    if (!agree(s)) {
-        for (int32_t axis = 0, axis_end = s->hypotheses.count > 1 ? s->dim : 0; axis < axis_end; axis++) {
+    bool are_wrong = s->hypotheses.count > 1 && status->mean_nis > tuning->phases_nis;
+    if (are_wrong) {
+        for (int32_t axis = 0, axis_end = s->dim; axis < axis_end; axis++) {
             s->P[at(axis, axis)] += square(tuning->slip_std_m);
         }
+    }
+    if (are_wrong || !agree(s)) {
         close_phases(s);
     }
     return agree(s) && (real)(status->epoch_ticks - status->start_ticks) * TICK_S >= tuning->phases_start_s;
@@ -8083,13 +8086,13 @@ SKYLESS_EXPORT void skyless_begin_tag(Tag *t, int32_t site, real qa, real lowest
             .height_margin_m = REAL(1.0), .neighbourhood = REAL(1.5), .most_horizontal_std_m = REAL(3.0),
             .zero_variance_m2 = REAL(10000.0), .phases_start_s = REAL(2.0), .phase_start_std_m = REAL(0.003),
             .phase_max_std_m = REAL(0.006), .phase_mesh_std_m = REAL(0.0012), .phase_wander = REAL(25.0), .phase_gate =
-            REAL(0.35), .phase_share = REAL(0.1), .phase_step_m = REAL(0.02), .pair_share = REAL(0.2), .slip_std_m =
-            REAL(0.05), .phases_walk_scale = REAL(8.0), .most_cycles = REAL(4.5), .start_wild = REAL(0.009), .least_wild
-            = REAL(0.002), .most_wild = REAL(0.01), .unlikely_log_odds = REAL(10.0), .alike = REAL(0.15),
-            .phase_walking_mps = REAL(0.75), .speed_memory_s = REAL(1.0), .phases_in_row = REAL(4.0), .uncovered_chi2 =
-            REAL(240.0), .max_open_level_std = REAL(0.02), .contradicted_start_s = REAL(5.0), .probe_m = REAL(1.0),
-            .shift_part = REAL(0.25), .apart_chi2 = REAL(20.0), .sensor_valid_s = REAL(1.0)}, .is_starting = true,
-            .misfit = -1, .relays_may_contradict = true, .may_begin_again = true};
+            REAL(0.35), .phase_share = REAL(0.1), .phase_step_m = REAL(0.02), .pair_share = REAL(0.2), .phases_nis =
+            REAL(1.6), .slip_std_m = REAL(0.05), .phases_walk_scale = REAL(8.0), .most_cycles = REAL(4.0), .start_wild =
+            REAL(0.009), .least_wild = REAL(0.002), .most_wild = REAL(0.01), .unlikely_log_odds = REAL(10.0), .alike =
+            REAL(0.15), .phase_walking_mps = REAL(0.75), .speed_memory_s = REAL(1.0), .phases_in_row = REAL(4.0),
+            .uncovered_chi2 = REAL(240.0), .max_open_level_std = REAL(0.02), .contradicted_start_s = REAL(5.0), .probe_m
+            = REAL(1.0), .shift_part = REAL(0.25), .apart_chi2 = REAL(20.0), .sensor_valid_s = REAL(1.0)}, .is_starting
+            = true, .misfit = -1, .relays_may_contradict = true, .may_begin_again = true};
     t->owner.qa = qa;
     t->owner.lowest_m = lowest_m;
     t->owner.highest_m = highest_m;

@@ -860,8 +860,9 @@ typedef struct Tuning {
     /* Largest standard deviation of a pair's constant at which its phases are used, and of one of these at which it
      * changes the constant, as a fraction of a wavelength. */
     real pair_share;
-    /* What is added to the standard deviation of the position where stamps contradict all hypotheses on cycles, and to
-     * that of an anchor's clock whose relays' stamps contradict their phases: about a wavelength [m]. */
+    real phases_nis;  /* Mean NIS beyond which all hypotheses on cycles are given up … */
+    /* … and what is then added to the standard deviation of the position, or to that of an anchor's clock whose relays'
+     * stamps contradict their phases: about a wavelength [m]. */
     real slip_std_m;
     /* Largest factor on the random walk of the tag's clock at which phases are taken at several cycles. */
     real phases_walk_scale;
